@@ -1,0 +1,7 @@
+"""The tasks, as Brax environments on exact physics. Knows nothing of learning."""
+
+from envs.registry import ALIASES, get_spec, list_tasks, make
+from envs.task import TaskEnv, TaskSpec
+from envs.wrappers import AutoReset
+
+__all__ = ["ALIASES", "AutoReset", "TaskEnv", "TaskSpec", "get_spec", "list_tasks", "make"]

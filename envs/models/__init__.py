@@ -1,0 +1,111 @@
+"""MuJoCo models: the ant alone, in a maze, and with a ball, built as OGBench 1.2.2 builds them."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import mujoco
+
+from envs.maze import WALL_HALF_SIZE, Maze
+
+_ANT = Path(__file__).with_name("ant.xml")
+
+# Collision bits of ``near_walls_model``: what the ant touches, what the ball touches, the ant against the ball.
+_ANT_BIT, _KICK_BIT, _BALL_BIT = 1, 2, 4
+
+
+def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
+    """The exact model, for MuJoCo C.
+
+    Order and attributes of geoms follow OGBench (walls row by row, then the target, then the ball), for contacts are
+    solved in that order and the results shall agree bit for bit.
+
+    Args:
+        maze: its walls are added; None leaves an open floor, without target.
+        ball: add the soccer ball (a free body after the ant's).
+    """
+    tree = ET.parse(_ANT)
+    world = _find(tree, ".//worldbody")
+    if maze is not None:
+        _add_walls(tree, world, maze)
+    if ball:
+        _add_ball(world)
+    return mujoco.MjModel.from_xml_string(ET.tostring(tree.getroot(), encoding="unicode"))
+
+
+def near_walls_model(ball: bool = False) -> mujoco.MjModel:
+    """The model for MJX: open floor, and three mocap boxes per free body for the walls that can be in reach.
+
+    Mocap bodies come in this order: the ant's three, the ball's three. Differences from ``ant_model``:
+
+    - Only moving geoms have ``contype``: MJX collides the floor with mocap boxes, which C filters as static.
+    - A body touches its own boxes only (collision bits below).
+    - At most 12 contacts per dimension, the deepest; 8 solver and 12 line-search iterations. MJX finds a numeric's
+      value by index, not by address, so that this one has to come before any longer one.
+    """
+    tree = ET.parse(_ANT)
+    root = tree.getroot()
+    custom = ET.SubElement(root, "custom")
+    ET.SubElement(custom, "numeric", name="max_contact_points", data="12")
+    option = _find(tree, "option")
+    option.set("iterations", "8")
+    option.set("ls_iterations", "12")
+    world = _find(tree, ".//worldbody")
+    for geom in _find(tree, ".//body[@name='torso']").iter("geom"):
+        geom.set("contype", str(_ANT_BIT | _KICK_BIT))
+        geom.set("conaffinity", "0")
+    floor = _find(tree, ".//geom[@name='floor']")
+    floor.set("contype", "0")
+    floor.set("conaffinity", str(_ANT_BIT | _BALL_BIT))
+    if ball:
+        geom = _add_ball(world)
+        geom.set("contype", str(_BALL_BIT))
+        geom.set("conaffinity", str(_KICK_BIT))
+    for owner, bit in (("ant", _ANT_BIT), ("ball", _BALL_BIT))[: 2 if ball else 1]:
+        for k in range(3):
+            box = ET.SubElement(world, "body", name=f"{owner}_wall_{k}", mocap="true", pos="0 0 -10")
+            size = " ".join(map(str, WALL_HALF_SIZE))
+            ET.SubElement(box, "geom", type="box", size=size, contype="0", conaffinity=str(bit), material="wall")
+    return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+
+
+def _add_ball(world: ET.Element) -> ET.Element:
+    """Adds the ball's body to ``world``; returns its geom."""
+    body = ET.SubElement(world, "body", name="ball", pos="0 0 0.5")
+    ET.SubElement(body, "freejoint", name="ball_root")
+    return ET.SubElement(
+        body, "geom", name="ball", size=".25", material="ball", priority="1", conaffinity="1", condim="6"
+    )
+
+
+def _add_walls(tree: ET.ElementTree, world: ET.Element, maze: Maze) -> None:
+    half_x, half_y, half_z = WALL_HALF_SIZE
+    rows, columns = maze.grid.shape
+    for i in range(rows):
+        for j in range(columns):
+            if maze.grid[i, j] == 1:
+                x, y = maze.ij_to_xy((i, j))
+                ET.SubElement(
+                    world,
+                    "geom",
+                    name=f"block_{i}_{j}",
+                    type="box",
+                    pos=f"{x} {y} {half_z}",
+                    size=f"{half_x} {half_y} {half_z}",
+                    contype="1",
+                    conaffinity="1",
+                    material="wall",
+                )
+    floor = _find(tree, ".//geom[@name='floor']")
+    floor.set("pos", f"{2 * (columns - 3)} {2 * (rows - 3)} 0")
+    floor.set("size", f"{2 * columns} {2 * rows} 0.2")
+    target = {"name": "target", "type": "cylinder", "size": ".5 .05", "pos": "0 0 .05", "material": "target"}
+    ET.SubElement(world, "geom", target, contype="0", conaffinity="0")
+
+
+def _find(tree: ET.ElementTree, path: str) -> ET.Element:
+    element = tree.find(path)
+    if element is None:
+        raise ValueError(f"ant.xml has no element {path}")
+    return element

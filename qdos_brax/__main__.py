@@ -1,0 +1,8 @@
+"""``python -m qdos_brax``: data, evaluate, report, tasks, doctor."""
+
+import sys
+
+from qdos_brax.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,230 @@
+"""The command lines of ``train.py`` and ``python -m qdos_brax``: parsing, and one clear line for what is wrong."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from qdos_brax import __version__
+from qdos_brax.config import Config, load_config, nearest, presets
+from qdos_brax.errors import UserError
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with errors of one line, and no flag understood by its first letters."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**{"allow_abbrev": False, **kwargs})
+
+    def error(self, message: str) -> NoReturn:
+        """Prints the line and exits with code 2."""
+        self.exit(2, f"error: {message} (see {self.prog} --help)\n")
+
+
+def train_main(argv: Sequence[str] | None = None) -> int:
+    """``python train.py``: the exit code."""
+    started = time.perf_counter()
+    args = _parse(train_parser(), sys.argv[1:] if argv is None else argv)
+    return _guarded(lambda: _train(args, started))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """``python -m qdos_brax``: the exit code."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    args = _parse(main_parser(argv), argv)
+    return _guarded(lambda: args.run(args))
+
+
+def train_parser() -> Parser:
+    """The flags of ``train.py``."""
+    parser = Parser(
+        prog="python train.py",
+        description="Collects or reads data, pretrains skills, labels the data, learns online, evaluates and reports.",
+        epilog="Every key of config.yaml can be set with --set; the values of a task and the presets lie in configs/.",
+    )
+    parser.add_argument("--env", metavar="TASK", help="the task, as listed by: python -m qdos_brax tasks")
+    parser.add_argument(
+        "--alpha", metavar="A[,A..]", help="weight of the mutual-information loss; several values make a scan"
+    )
+    parser.add_argument("--seed", metavar="S[,S..]", help="seed; several make a scan (default 0)")
+    parser.add_argument("--method", metavar="NAME", help="the method (default qdos)")
+    parser.add_argument(
+        "--preset",
+        metavar="NAME",
+        help=f"sizes of networks and budgets: {', '.join(presets())} (default cpu without an accelerator, else paper)",
+    )
+    parser.add_argument("--out", metavar="DIR", help="the run folder (default: a new one under runs/)")
+    parser.add_argument(
+        "--resume", metavar="DIR", help="go on with the run in DIR, exactly where it was; takes no other flag"
+    )
+    parser.add_argument(
+        "--dataset", metavar="FILE", help="OGBench .npz or D4RL .hdf5 (default: the task's own set, collected once)"
+    )
+    parser.add_argument(
+        "--physics",
+        metavar="ENGINE",
+        help="auto, mjx or mujoco (default auto: MuJoCo C where there is only a CPU, MJX on an accelerator)",
+    )
+    parser.add_argument("--steps", metavar="N", help="environment steps of the online phase")
+    parser.add_argument("--pretrain-steps", metavar="N", help="gradient steps of the values and of the skills, each")
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="any key of the configuration, such as skills.kl_weight=0.2; may be given again and again",
+    )
+    parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
+    return parser
+
+
+def _parse(parser: Parser, argv: Sequence[str]) -> argparse.Namespace:
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        word = unknown[0].partition("=")[0]
+        parser.error(f"unknown argument {unknown[0]}{nearest(word, _flags(parser))}")
+    return args
+
+
+def _flags(parser: argparse.ArgumentParser) -> list[str]:
+    """The long flags of a parser and of its commands."""
+    flags = [name for action in parser._actions for name in action.option_strings if name.startswith("--")]
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            flags += [name for command in action.choices.values() for name in _flags(command)]
+    return flags
+
+
+def config_from_args(args: argparse.Namespace) -> Config:
+    """The configuration that the flags of ``train.py`` ask for.
+
+    Raises:
+        UserError: a value is wrong.
+    """
+    by_key = {
+        "skills.alpha": args.alpha,
+        "seed": args.seed,
+        "method": args.method,
+        "out": args.out,
+        "dataset": args.dataset,
+        "physics": args.physics,
+        "high_level.env_steps": args.steps,
+        "values.updates": args.pretrain_steps,
+        "skills.updates": args.pretrain_steps,
+    }
+    flags = {key: value for key, value in by_key.items() if value is not None}
+    return load_config(args.env, args.preset, flags, args.set)
+
+
+def _train(args: argparse.Namespace, started: float) -> int:
+    given = [name for name, value in vars(args).items() if name != "resume" and value]
+    if args.resume is not None and given:
+        raise UserError(f"--resume goes on with the run's own config.yaml; leave out --{given[0].replace('_', '-')}")
+    if args.resume is None and args.env is None:
+        raise UserError("give a task with --env (python -m qdos_brax tasks lists them), or a run to --resume")
+
+    from qdos_brax import train_flow  # here, so that --help and a wrong flag answer at once
+
+    if args.resume is None:
+        train_flow.start(lambda: config_from_args(args), preset_given=args.preset is not None, started=started)
+    else:
+        train_flow.resume(args.resume, started=started)
+    return 0
+
+
+def main_parser(argv: Sequence[str]) -> Parser:
+    """The commands of ``python -m qdos_brax``; those of ``data`` only where ``argv`` asks for them."""
+    parser = Parser(prog="python -m qdos_brax", description="Data, evaluation, reports, and a look at this machine.")
+    parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    if argv[:1] == ["data"]:
+        from qdos_brax.data.commands import add_parser  # imports jax and h5py, which the others need not wait for
+
+        add_parser(commands)
+    else:
+        commands.add_parser("data", help="make, look at and check data files")
+
+    evaluate = commands.add_parser("evaluate", help="evaluate the policy of a run")
+    evaluate.add_argument("runs", metavar="RUN", nargs="+", help="a run folder")
+    evaluate.add_argument(
+        "--episodes", metavar="N", type=_positive, default=20, help="episodes per member (default 20)"
+    )
+    evaluate.set_defaults(run=_evaluate)
+
+    report = commands.add_parser("report", help="draw the learning curves of runs")
+    report.add_argument("runs", metavar="RUN", nargs="+", help="a run folder")
+    report.add_argument(
+        "--out", metavar="FILE", help="the picture (default: curves.png, in the folder of a single run)"
+    )
+    report.set_defaults(run=_report)
+
+    tasks = commands.add_parser("tasks", help="list the tasks and their aliases")
+    tasks.set_defaults(run=_tasks)
+
+    doctor = commands.add_parser("doctor", help="check versions, devices, caches and callbacks of this machine")
+    doctor.set_defaults(run=_doctor)
+    return parser
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from qdos_brax import train_flow
+    from qdos_brax.methods.build import evaluate_run
+
+    train_flow.prepare_jax()
+    for run in args.runs:
+        for member in evaluate_run(Path(run), args.episodes):
+            print(f"{run}: " + ", ".join(f"{name} {value:g}" for name, value in member.items()))
+    return 0
+
+
+def _report(args: argparse.Namespace) -> int:
+    from qdos_brax.report.curves import draw_curves
+
+    runs = [Path(run) for run in args.runs]
+    out = Path(args.out) if args.out else (runs[0] if len(runs) == 1 else Path()) / "curves.png"
+    draw_curves(runs, out)
+    print(out)
+    return 0
+
+
+def _tasks(args: argparse.Namespace) -> int:
+    import envs
+
+    full_names: dict[str, list[str]] = {}
+    for spec in envs.list_tasks():
+        full_names.setdefault(spec.name, []).append(f"task{spec.task_id}")
+    for name, tasks in full_names.items():
+        aliases = [alias for alias, target in envs.ALIASES.items() if target == name]
+        default = envs.get_spec(name).full_name.removeprefix(f"{name}-")
+        note = f"  (also: {', '.join(aliases)})" if aliases else ""
+        print(f"{name:24s} {tasks[0]} to {tasks[-1]}, default {default}{note}")
+    return 0
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from qdos_brax.doctor import examine
+
+    return 0 if examine() else 1
+
+
+def _positive(text: str) -> int:
+    number = int(text) if text.isdigit() else 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1, not {text!r}")
+    return number
+
+
+def _guarded(work: Callable[[], int | None]) -> int:
+    """The exit code of ``work``; a user's error is one line and code 2."""
+    try:
+        return work() or 0
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130

@@ -1,0 +1,107 @@
+"""Default sets: collected once per machine, kept in a folder, shared by all tasks of a maze."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from envs.task import TaskEnv
+from qdos_brax.data import collect, formats
+from qdos_brax.data.quality import QUALITY
+from qdos_brax.errors import UserError
+from qdos_brax.experts import walker
+
+
+def folder() -> Path:
+    """Where default sets lie: ``$QDOS_DATA``, else ``~/.cache/qdos_brax/data``."""
+    return Path(os.environ.get("QDOS_DATA") or "~/.cache/qdos_brax/data").expanduser()
+
+
+def default_dataset(
+    env: TaskEnv, transitions: int, degraded_share: float, noise: float, seed: int, num_envs: int = 64
+) -> Path:
+    """The path of the set with these parameters; collects it if it is not there.
+
+    Two processes that ask at once collect it once: the second waits. What lies under the name is always whole.
+
+    Args:
+        env: the task; the set is that of its maze, for the rows are labelled when they are read.
+        transitions: rows.
+        degraded_share: share of degraded episodes.
+        noise: standard deviation of the action noise of the others.
+        seed: of the collection.
+        num_envs: environments stepped at once.
+
+    Raises:
+        UserError: a parameter is out of range, or the folder cannot be written.
+    """
+    policy = walker.load()
+    parameters = f"n{transitions}-bad{degraded_share:g}-noise{noise:g}-seed{seed}-envs{num_envs}"
+    version = f"{env.backend}-v{collect.RECIPE}-{_digest(policy.params)}"
+    path = folder() / f"{env.spec.name}-{parameters}-{version}.hdf5"
+    if path.exists():
+        return path
+    with _locked(path):
+        if not path.exists():  # another process may have made it while this one waited
+            print(f"no data for {env.spec.name} yet: collecting {transitions:,} transitions into {path}", flush=True)
+            make_file(path, env, transitions, degraded_share, noise, seed, num_envs, policy)
+    return path
+
+
+def make_file(
+    path: Path,
+    env: TaskEnv,
+    transitions: int,
+    degraded_share: float,
+    noise: float,
+    seed: int,
+    num_envs: int,
+    policy: walker.WalkerPolicy | None = None,
+) -> None:
+    """Collects a set (see ``collect.collect``) with a progress bar and writes it to ``path``."""
+    with tqdm(total=transitions, unit="steps", unit_scale=True, desc="collect", file=sys.stderr) as bar:
+
+        def report(done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        rows = collect.collect(env, transitions, degraded_share, noise, seed, num_envs, report, policy)
+    counts = np.bincount(rows["infos/quality"], minlength=len(QUALITY))
+    attributes = {
+        "env": env.spec.full_name,
+        "seed": seed,
+        "recipe": f"degraded_share={degraded_share:g} noise={noise:g} num_envs={num_envs} physics={env.backend}",
+        "composition": " ".join(f"{name}={counts[code] / transitions:.3f}" for name, code in QUALITY.items()),
+        "version": collect.RECIPE,
+    }
+    formats.write_hdf5(path, rows, attributes)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Holds the lock of ``path``; the system releases it when the process ends, however it ends."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = open(path.with_suffix(".lock"), "w")  # noqa: SIM115 (closed below)
+    except OSError as error:
+        raise UserError(f"{path.parent} cannot be written ({error.strerror}); set QDOS_DATA to another folder") from None
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _digest(params: Any) -> str:
+    """Eight hex digits that tell one walker's weights from another's."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(params):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()[:8]

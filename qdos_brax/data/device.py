@@ -1,0 +1,87 @@
+"""The data set on the device: loaded once, normalised once, shared by every member of a population."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.segments import macro_return, segment_starts, window
+
+
+@struct.dataclass
+class Normaliser:
+    """Fixed statistics of the data: x -> (x - mean) / scale.
+
+    Attributes:
+        mean: float32[obs].
+        scale: float32[obs], the standard deviation, at least 1e-3 (a constant column stays finite).
+    """
+
+    mean: jax.Array
+    scale: jax.Array
+
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """Normalises [..., obs]."""
+        return (observation - self.mean) / self.scale
+
+
+@struct.dataclass
+class DeviceData:
+    """N transitions as device arrays; observations are normalised, rewards and masks are the task's.
+
+    Attributes:
+        observations: float32[N, obs].
+        next_observations: float32[N, obs].
+        actions: float32[N, act].
+        rewards: float32[N].
+        masks: float32[N].
+        starts: int32[S], first rows of all windows of H steps inside one episode.
+        qpos: float32[N, nq], or None when the file holds no simulator states.
+        qvel: float32[N, nv], or None.
+    """
+
+    observations: jax.Array
+    next_observations: jax.Array
+    actions: jax.Array
+    rewards: jax.Array
+    masks: jax.Array
+    starts: jax.Array
+    qpos: jax.Array | None
+    qvel: jax.Array | None
+
+
+@struct.dataclass
+class MacroRows:
+    """Windows seen as macro transitions, leading axis B: reward is the discounted sum over the live steps."""
+
+    observation: jax.Array
+    reward: jax.Array
+    mask: jax.Array
+    next_observation: jax.Array
+
+
+def to_device(dataset: Dataset, horizon: int) -> tuple[DeviceData, Normaliser]:
+    """Puts ``dataset`` on the default device, normalised by its own statistics."""
+    mean = dataset.observations.mean(axis=0, dtype=np.float64).astype(np.float32)
+    scale = np.maximum(dataset.observations.std(axis=0, dtype=np.float64), 1e-3).astype(np.float32)
+    normaliser = Normaliser(jnp.asarray(mean), jnp.asarray(scale))
+    data = DeviceData(
+        observations=normaliser(jnp.asarray(dataset.observations)),
+        next_observations=normaliser(jnp.asarray(dataset.next_observations)),
+        actions=jnp.asarray(dataset.actions),
+        rewards=jnp.asarray(dataset.rewards),
+        masks=jnp.asarray(dataset.masks),
+        starts=jnp.asarray(segment_starts(dataset.ends, horizon)),
+        qpos=None if dataset.qpos is None else jnp.asarray(dataset.qpos),
+        qvel=None if dataset.qvel is None else jnp.asarray(dataset.qvel),
+    )
+    return data, normaliser
+
+
+def macro_rows(data: DeviceData, starts: jax.Array, horizon: int, discount: jax.Array | float) -> MacroRows:
+    """The windows at ``starts[B]`` as macro transitions of ``horizon`` steps."""
+    reward, mask = macro_return(*window((data.rewards, data.masks), starts, horizon), discount)
+    return MacroRows(data.observations[starts], reward, mask, data.next_observations[starts + horizon - 1])

@@ -1,0 +1,81 @@
+"""How good a segment truly is, and how well scores tell good ones from bad ones. For measuring, never for training."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import rankdata
+
+from qdos_brax.data.dataset import Dataset
+
+QUALITY = {"navigate": 0, "noisy": 1, "wander": 2, "fail": 3}
+"""What produced a step; every code but 0 is degraded behaviour."""
+
+MARGIN = 1.5
+"""Maze units (a cell has 4) that a segment must gain or lose to count as progress or as a setback."""
+
+
+def progress(env: Any, dataset: Dataset, starts: np.ndarray, horizon: int) -> np.ndarray:
+    """float64[S], distance left at s_0 minus distance left at s_H, of the segments that begin at ``starts``.
+
+    ``env.true_distance`` is the shortest path to the task's goal (soccer: agent to ball plus ball to goal). Positions
+    are stored before the action, so a segment that ends its episode is measured at s_{H-1}, one step short.
+
+    Raises:
+        ValueError: the dataset has no qpos.
+    """
+    if dataset.qpos is None:
+        raise ValueError(f"{dataset.source}: progress needs the simulator's qpos")
+    distance = np.asarray(env.true_distance(dataset.qpos), np.float64)
+    last = np.asarray(starts) + horizon - 1
+    return distance[starts] - distance[np.where(dataset.ends[last], last, np.minimum(last + 1, dataset.size - 1))]
+
+
+def auc(scores: np.ndarray, positive: np.ndarray) -> float:
+    """The chance that a positive's score exceeds a negative's, ties counted half (ROC AUC); NaN without both kinds.
+
+    Args:
+        scores: float[S].
+        positive: bool[S].
+    """
+    scores, positive = np.asarray(scores, np.float64), np.asarray(positive, bool)
+    num_positive = int(positive.sum())
+    num_negative = len(positive) - num_positive
+    if num_positive == 0 or num_negative == 0:
+        return float("nan")
+    rank_sum = rankdata(scores)[positive].sum()
+    return float((rank_sum - num_positive * (num_positive + 1) / 2) / (num_positive * num_negative))
+
+
+def report(
+    scores: np.ndarray, weights: np.ndarray, gains: np.ndarray, degraded: np.ndarray | None = None
+) -> dict[str, float]:
+    """How well ``scores`` (advantages) rank segments, and what ``weights`` made of them.
+
+    Args:
+        scores: float[S], higher should mean better.
+        weights: float[S], non-negative training weights of the same segments.
+        gains: float[S], ``progress`` in maze units.
+        degraded: bool[S], behaviour known to be bad, or None.
+
+    Returns:
+        auc_progress: gains > MARGIN against gains < -MARGIN. auc_degraded: undegraded against degraded.
+        effective_share: effective sample size (sum w)^2 / sum w^2, as a share of S. losing_share, gaining_share: share
+        of all segments that lose or gain more than MARGIN. losing_weight, gaining_weight: their shares of the weight.
+    """
+    weights = np.asarray(weights, np.float64)
+    losing, gaining = gains < -MARGIN, gains > MARGIN
+    decided = losing | gaining
+    total = weights.sum()
+    numbers = {
+        "auc_progress": auc(scores[decided], gaining[decided]),
+        "effective_share": float(total**2 / (np.square(weights).sum() * len(weights))),
+        "losing_share": float(losing.mean()),
+        "losing_weight": float(weights[losing].sum() / total),
+        "gaining_share": float(gaining.mean()),
+        "gaining_weight": float(weights[gaining].sum() / total),
+    }
+    if degraded is not None:
+        numbers["auc_degraded"] = auc(scores, ~np.asarray(degraded, bool))
+    return numbers

@@ -1,0 +1,119 @@
+"""A look at this machine: what is installed, what jax sees, where caches lie, and whether callbacks come back."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import metadata
+
+from qdos_brax.runs import compile_cache
+
+_PACKAGES = (
+    "qdos-brax",
+    "brax",
+    "jax",
+    "jaxlib",
+    "mujoco",
+    "mujoco-mjx",
+    "flax",
+    "optax",
+    "orbax-checkpoint",
+    "gymnasium",
+    "h5py",
+    "numpy",
+)
+_WATCHDOG_SECONDS = 120
+
+# A scan over callbacks, batched, as the MuJoCo C engine makes them. It runs in a process of its own, because a
+# callback that hangs cannot be stopped from inside.
+_CALLBACK_PROBE = """
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_cpu_enable_async_dispatch", False)
+def double(x):
+    return np.asarray(x) * 2
+def step(x, _):
+    return jax.pure_callback(double, jax.ShapeDtypeStruct(x.shape, x.dtype), x, vmap_method="broadcast_all") / 2, None
+run = jax.jit(jax.vmap(lambda x: jax.lax.scan(step, x, None, 50)[0]))
+x = jnp.ones((64, 4096))
+assert bool((run(x) == x).all())
+"""
+
+
+def examine() -> bool:
+    """Prints one line per check; whether all of them passed."""
+    checks: tuple[Callable[[], tuple[bool, str]], ...] = (
+        _python,
+        _packages,
+        _devices,
+        _compile_cache,
+        _data,
+        _callbacks,
+    )
+    results = []
+    for check in checks:
+        passed, line = check()
+        results.append(passed)
+        print(f"{'ok ' if passed else 'BAD'} {line}", flush=True)
+    return all(results)
+
+
+def _python() -> tuple[bool, str]:
+    good = sys.version_info >= (3, 11)
+    return good, f"python {platform.python_version()}" + ("" if good else ": 3.11 or later is needed")
+
+
+def _packages() -> tuple[bool, str]:
+    missing, found = [], []
+    for name in _PACKAGES:
+        try:
+            found.append(f"{name} {metadata.version(name)}")
+        except metadata.PackageNotFoundError:
+            missing.append(name)
+    if missing:
+        return False, f"packages: {', '.join(missing)} not installed; run: pip install -c constraints.txt -e ."
+    return True, f"packages: {', '.join(found)}"
+
+
+def _devices() -> tuple[bool, str]:
+    import jax  # here, so that a jax that cannot start is one failed check and not the end of all
+
+    try:
+        devices = jax.devices()
+    except RuntimeError as error:
+        return False, f"devices: jax cannot start ({' '.join(str(error).split())})"
+    kinds = ", ".join(f"{device.platform}:{device.id} ({device.device_kind})" for device in devices)
+    return True, f"devices: {kinds}; {len(os.sched_getaffinity(0))} CPU cores"
+
+
+def _compile_cache() -> tuple[bool, str]:
+    folder = compile_cache.enable()
+    if folder is None:
+        return False, f"compile cache: {compile_cache.cache_folder()} cannot be written; set JAX_COMPILATION_CACHE_DIR"
+    entries = sum(1 for path in folder.iterdir() if path.is_file())
+    return True, f"compile cache: {folder}, {entries} files"
+
+
+def _data() -> tuple[bool, str]:
+    from qdos_brax.data import cache
+
+    folder = cache.data_folder()
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    free = shutil.disk_usage(there).free / 2**30
+    good = os.access(there, os.W_OK)
+    return good, f"data: {folder}, {free:.0f} GiB free" + ("" if good else "; it cannot be written, set QDOS_DATA")
+
+
+def _callbacks() -> tuple[bool, str]:
+    command = [sys.executable, "-c", _CALLBACK_PROBE]
+    try:
+        done = subprocess.run(command, timeout=_WATCHDOG_SECONDS, capture_output=True, text=True, check=False)
+    except subprocess.TimeoutExpired:
+        return False, f"callbacks: no answer in {_WATCHDOG_SECONDS} s; MuJoCo C cannot be used, take --physics mjx"
+    if done.returncode:
+        reason = next(reversed(done.stderr.strip().splitlines()), "no message")
+        return False, f"callbacks: failed ({reason}); MuJoCo C cannot be used, take --physics mjx"
+    return True, "callbacks: compiled programs and Python answer each other"

@@ -1,0 +1,60 @@
+"""Evaluation: whole episodes on environments of their own, the actor's mode, no exploration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+from qdos_brax.high_level.macro_step import macro_step
+
+
+class Episodes(NamedTuple):
+    """One entry per episode: success[N] (0 or 1), undiscounted episode_return[N], length[N] in environment steps."""
+
+    success: jax.Array
+    episode_return: jax.Array
+    length: jax.Array
+
+
+def evaluate(
+    env: Env,
+    choose: Callable[[jax.Array], jax.Array],
+    play: Callable[[jax.Array, jax.Array], jax.Array],
+    key: jax.Array,
+    episodes: int,
+    horizon: int,
+) -> Episodes:
+    """Plays ``episodes`` episodes side by side until all are over.
+
+    Args:
+        env: the task.
+        choose: observation[obs] -> skill z[latent], asked every ``horizon`` steps.
+        play: (observation[obs], z[latent]) -> action.
+        key: for the starts.
+        episodes: how many.
+        horizon: environment steps per decision.
+    """
+
+    def one(state: State) -> tuple[State, jax.Array, jax.Array, jax.Array]:
+        latent = choose(state.obs)
+        state, result = macro_step(env, lambda observation: play(observation, latent), state, horizon, 1.0)
+        return state, result.success, result.episode_return, result.steps
+
+    def going(carry: tuple[State, Episodes]) -> jax.Array:
+        return jnp.any(carry[0].done < 0.5)
+
+    def body(carry: tuple[State, Episodes]) -> tuple[State, Episodes]:
+        state, totals = carry
+        state, success, episode_return, steps = jax.vmap(one)(state)
+        totals = Episodes(
+            jnp.maximum(totals.success, success), totals.episode_return + episode_return, totals.length + steps
+        )
+        return state, totals
+
+    start = jax.vmap(env.reset)(jax.random.split(key, episodes))
+    zeros = jnp.zeros(episodes)
+    return jax.lax.while_loop(going, body, (start, Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32))))[1]

@@ -1,0 +1,72 @@
+"""One decision of the high level: a skill, played for H environment steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+
+class MacroStep(NamedTuple):
+    """What a macro step brought; scalars but for the observation.
+
+    Attributes:
+        reward: sum of discounted environment rewards over the live steps.
+        mask: 0 if the episode terminated within it; a cut-off episode keeps 1.
+        next_observation: [obs], after the last live step.
+        steps: live environment steps, 1 to H.
+        episode_return: undiscounted sum of rewards over the live steps.
+        success: 1 if the goal was reached.
+        finite: False if the simulation broke; such a step must not be learned from.
+    """
+
+    reward: jax.Array
+    mask: jax.Array
+    next_observation: jax.Array
+    steps: jax.Array
+    episode_return: jax.Array
+    success: jax.Array
+    finite: jax.Array
+
+
+def macro_step(
+    env: Env, policy: Callable[[jax.Array], jax.Array], state: State, horizon: int, discount: jax.Array | float
+) -> tuple[State, MacroStep]:
+    """Plays ``policy`` (observation -> action) for ``horizon`` steps of one environment, batched by ``jax.vmap``.
+
+    An episode that ends early idles to the end of the macro step: its state stays, and only live steps count. The
+    environment is not reset. A state that is done already gives a macro step of no live steps and reward 0.
+    """
+
+    def step(carry: tuple[State, MacroStep], power: jax.Array) -> tuple[tuple[State, MacroStep], None]:
+        state, result = carry
+        alive = state.done < 0.5
+        new = env.step(state, policy(state.obs))
+        finite = jnp.all(jnp.isfinite(new.obs)) & jnp.isfinite(new.reward)
+        terminated = (new.done > 0.5) & (new.info["truncation"] < 0.5)
+        live = alive.astype(jnp.float32)
+        result = MacroStep(
+            reward=result.reward + live * discount**power * new.reward,
+            mask=jnp.where(alive & terminated, 0.0, result.mask),
+            next_observation=jnp.where(alive, new.info["final_obs"], result.next_observation),
+            steps=result.steps + alive.astype(jnp.int32),
+            episode_return=result.episode_return + live * new.reward,
+            success=jnp.maximum(result.success, live * new.metrics["success"]),
+            finite=result.finite & (finite | ~alive),
+        )
+        return (jax.tree.map(lambda a, b: jnp.where(alive, a, b), new, state), result), None
+
+    zero = jnp.zeros(())
+    start = MacroStep(zero, jnp.ones(()), state.obs, jnp.zeros((), jnp.int32), zero, zero, jnp.ones((), bool))
+    (state, result), _ = jax.lax.scan(step, (state, start), jnp.arange(horizon))
+    return state, result
+
+
+def reset_done(env: Env, state: State, broken: jax.Array, key: jax.Array) -> State:
+    """A fresh episode where the old one is over or the simulation broke; for one environment."""
+    fresh = env.reset(key)
+    over = (state.done > 0.5) | broken
+    return jax.tree.map(lambda a, b: jnp.where(over, a, b), fresh, state)

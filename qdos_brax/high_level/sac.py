@@ -1,0 +1,179 @@
+"""Soft actor-critic with a critic ensemble (Haarnoja et al. 2018; REDQ, Chen et al. 2021; RLPD, Ball et al. 2023).
+
+Losses are functions of parameters and a batch; ``SAC`` holds the networks and static sizes; everything that learns or
+may be scanned is an argument, so that members of a population differ along a ``vmap`` axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from qdos_brax.networks import DiagonalGaussian, Ensemble, tanh_gaussian_sample
+
+Params = Any
+
+
+class Batch(NamedTuple):
+    """Transitions, leading axis B. ``mask`` is 0 where the value of ``next_observation`` must not be used."""
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    mask: jax.Array
+    next_observation: jax.Array
+
+
+@struct.dataclass
+class SACHyper:
+    """Numbers a scan may vary: learning rate, discount per transition, Polyak rate, target entropy (nats)."""
+
+    learning_rate: jax.Array | float
+    discount: jax.Array | float
+    target_rate: jax.Array | float
+    target_entropy: jax.Array | float
+
+
+@struct.dataclass
+class SACState:
+    """Everything that learns: parameters, the target ensemble, the temperature, and Adam's moments for each."""
+
+    actor: Params
+    critic: Params
+    target_critic: Params
+    log_temperature: jax.Array
+    actor_moments: optax.OptState
+    critic_moments: optax.OptState
+    temperature_moments: optax.OptState
+
+
+ADAM = optax.scale_by_adam()
+
+
+def adam_step(params: Params, moments: optax.OptState, grads: Params, learning_rate: Any) -> tuple[Params, Any]:
+    """One Adam step with a learning rate that may be traced: (new parameters, new moments)."""
+    updates, moments = ADAM.update(grads, moments, params)
+    return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), moments
+
+
+class SAC:
+    """The learner.
+
+    Args:
+        observation_dim: width of observations.
+        action_dim: width of actions, which lie in (-1, 1).
+        hidden: hidden widths of actor and critics.
+        ensemble: number of critics, with LayerNorm.
+        target_subset: random critics of the target ensemble whose minimum is the bootstrap value.
+        entropy_backup: subtract the entropy term from the bootstrap value (SAC does, RLPD's mazes do not).
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        hidden: Sequence[int],
+        ensemble: int,
+        target_subset: int,
+        entropy_backup: bool = False,
+    ) -> None:
+        self.observation_dim, self.action_dim = observation_dim, action_dim
+        self.ensemble, self.target_subset, self.entropy_backup = ensemble, target_subset, entropy_backup
+        self.actor = DiagonalGaussian(tuple(hidden), action_dim)
+        self.critic = Ensemble(tuple(hidden), ensemble)
+        self._target_heads = Ensemble(tuple(hidden), target_subset)
+
+    def init(self, key: jax.Array, init_temperature: jax.Array | float) -> SACState:
+        """Fresh parameters; the target ensemble starts as a copy."""
+        actor_key, critic_key = jax.random.split(key)
+        observation = jnp.zeros((1, self.observation_dim))
+        actor = self.actor.init(actor_key, observation)
+        critic = self.critic.init(critic_key, jnp.zeros((1, self.observation_dim + self.action_dim)))
+        log_temperature = jnp.log(jnp.asarray(init_temperature, jnp.float32))
+        return SACState(
+            actor=actor,
+            critic=critic,
+            target_critic=jax.tree.map(jnp.copy, critic),
+            log_temperature=log_temperature,
+            actor_moments=ADAM.init(actor),
+            critic_moments=ADAM.init(critic),
+            temperature_moments=ADAM.init(log_temperature),
+        )
+
+    def act(self, actor: Params, key: jax.Array, observation: jax.Array) -> jax.Array:
+        """A sampled action[..., action_dim] in (-1, 1)."""
+        return tanh_gaussian_sample(key, *self.actor.apply(actor, observation))[0]
+
+    def mode(self, actor: Params, observation: jax.Array) -> jax.Array:
+        """The squashed mean action[..., action_dim], for evaluation."""
+        return jnp.tanh(self.actor.apply(actor, observation)[0])
+
+    def values(self, critic: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
+        """Q of every critic, [ensemble, ...]."""
+        return self.critic.apply(critic, jnp.concatenate([observation, action], axis=-1))
+
+    def target_value(self, state: SACState, key: jax.Array, next_observation: jax.Array) -> jax.Array:
+        """The bootstrap value[B]: min over a random subset of target critics at the actor's action.
+
+        Only the chosen heads are evaluated.
+        """
+        action_key, subset_key = jax.random.split(key)
+        action, log_prob = tanh_gaussian_sample(action_key, *self.actor.apply(state.actor, next_observation))
+        heads = jax.random.choice(subset_key, self.ensemble, (self.target_subset,), replace=False)
+        chosen = jax.tree.map(lambda p: p[heads], state.target_critic)
+        value = self._target_heads.apply(chosen, jnp.concatenate([next_observation, action], axis=-1)).min(axis=0)
+        if self.entropy_backup:
+            value = value - jnp.exp(state.log_temperature) * log_prob
+        return value
+
+    def critic_loss(self, critic: Params, batch: Batch, target: jax.Array) -> jax.Array:
+        """Mean over batch and sum over critics of the squared error to target[B]."""
+        error = self.values(critic, batch.observation, batch.action) - target
+        return jnp.mean(jnp.sum(error**2, axis=0))
+
+    def actor_loss(
+        self, actor: Params, critic: Params, temperature: jax.Array, observation: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """mean[temperature log pi(u | s) - mean_i Q_i(s, u)], and the policy's entropy estimate."""
+        action, log_prob = tanh_gaussian_sample(key, *self.actor.apply(actor, observation))
+        value = self.values(critic, observation, action).mean(axis=0)
+        return jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
+
+    def update_critic(
+        self, state: SACState, batch: Batch, key: jax.Array, hyper: SACHyper
+    ) -> tuple[SACState, dict[str, jax.Array]]:
+        """One step of every critic and of the target ensemble."""
+        bootstrap = self.target_value(state, key, batch.next_observation)
+        target = jax.lax.stop_gradient(batch.reward + hyper.discount * batch.mask * bootstrap)
+        loss, grads = jax.value_and_grad(self.critic_loss)(state.critic, batch, target)
+        critic, moments = adam_step(state.critic, state.critic_moments, grads, hyper.learning_rate)
+        target_critic = jax.tree.map(lambda t, c: t + hyper.target_rate * (c - t), state.target_critic, critic)
+        info = {"critic_loss": loss / self.ensemble, "q": jnp.mean(target)}
+        return state.replace(critic=critic, critic_moments=moments, target_critic=target_critic), info
+
+    def update_actor(
+        self, state: SACState, observation: jax.Array, key: jax.Array, hyper: SACHyper
+    ) -> tuple[SACState, dict[str, jax.Array]]:
+        """One step of the actor, then one of the temperature towards the target entropy."""
+        temperature = jnp.exp(state.log_temperature)
+        (loss, entropy), grads = jax.value_and_grad(self.actor_loss, has_aux=True)(
+            state.actor, state.critic, temperature, observation, key
+        )
+        actor, actor_moments = adam_step(state.actor, state.actor_moments, grads, hyper.learning_rate)
+        temperature_grad = temperature * (entropy - hyper.target_entropy)
+        log_temperature, temperature_moments = adam_step(
+            state.log_temperature, state.temperature_moments, temperature_grad, hyper.learning_rate
+        )
+        info = {"actor_loss": loss, "entropy": entropy, "temperature": temperature}
+        state = state.replace(
+            actor=actor,
+            actor_moments=actor_moments,
+            log_temperature=log_temperature,
+            temperature_moments=temperature_moments,
+        )
+        return state, info

@@ -1,0 +1,1 @@
+"""Pseudo-labels: which skill a segment played, what it earned, and how new it is to the learner."""

@@ -1,0 +1,88 @@
+"""The reward and mask that an offline macro transition is given: three options behind one interface."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from qdos_brax.data.device import MacroRows
+from qdos_brax.labels.reward_model import RewardModel, RewardModelState
+
+
+class OfflineReward(Protocol):
+    """A labeller: it may learn from online rows."""
+
+    def init(self, key: jax.Array) -> Any:
+        """What it carries."""
+        ...
+
+    def learn(self, state: Any, rows: MacroRows, action: jax.Array, learning_rate: Any, active: jax.Array) -> Any:
+        """One gradient step on online rows[B], if ``active``."""
+        ...
+
+    def label(self, state: Any, rows: MacroRows, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(reward[B], mask[B]) of offline rows[B]."""
+        ...
+
+
+class DataReward:
+    """The data set's own rewards and masks: rewards are present (the QDOS setting)."""
+
+    def init(self, key: jax.Array) -> dict[str, Any]:
+        """Carries nothing."""
+        return {}
+
+    def learn(self, state: Any, rows: MacroRows, action: jax.Array, learning_rate: Any, active: jax.Array) -> Any:
+        """Learns nothing."""
+        return state
+
+    def label(self, state: Any, rows: MacroRows, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As they are."""
+        return rows.reward, rows.mask
+
+
+class PredictedReward:
+    """The reward model's prediction, and its mask (SUPE on the kitchen; what the paper describes).
+
+    Args:
+        model: the reward model.
+    """
+
+    def __init__(self, model: RewardModel) -> None:
+        self._model = model
+
+    def init(self, key: jax.Array) -> RewardModelState:
+        """A fresh model."""
+        return self._model.init(key)
+
+    def learn(
+        self, state: RewardModelState, rows: MacroRows, action: jax.Array, learning_rate: Any, active: jax.Array
+    ) -> RewardModelState:
+        """One step of both heads."""
+        new = self._model.update(state, rows.observation, action, rows.reward, rows.mask, learning_rate)
+        return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, state)
+
+    def label(self, state: RewardModelState, rows: MacroRows, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Prediction, and the probability of going on."""
+        reward, logit = self._model.predict(state.params, rows.observation, action)
+        return reward, jax.nn.sigmoid(logit)
+
+
+class MinimumReward(PredictedReward):
+    """The lowest macro reward, with the model's mask (SUPE on the mazes).
+
+    Args:
+        model: the reward model.
+        minimum: the reward of a macro step in which every environment step earned the least.
+    """
+
+    def __init__(self, model: RewardModel, minimum: jax.Array | float) -> None:
+        super().__init__(model)
+        self._minimum = minimum
+
+    def label(self, state: RewardModelState, rows: MacroRows, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The constant, and the probability of going on."""
+        _, mask = super().label(state, rows, action)
+        return jnp.full_like(rows.reward, self._minimum), mask

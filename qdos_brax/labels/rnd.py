@@ -1,0 +1,56 @@
+"""Random network distillation (Burda et al. 2018): how new a (state, skill) pair is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.networks import MLP
+
+
+@struct.dataclass
+class RNDState:
+    """The fixed random network, the predictor that learns to imitate it, and Adam's moments."""
+
+    target: Any
+    predictor: Any
+    moments: optax.OptState
+
+
+class RND:
+    """The bonus.
+
+    Args:
+        input_dim: width of observation and action together.
+        hidden: hidden widths of both networks.
+        features: width of their output.
+    """
+
+    def __init__(self, input_dim: int, hidden: Sequence[int], features: int) -> None:
+        self._input_dim = input_dim
+        self._network = MLP((*hidden, features))
+
+    def init(self, key: jax.Array) -> RNDState:
+        """Two independent networks."""
+        target_key, predictor_key = jax.random.split(key)
+        example = jnp.zeros((1, self._input_dim))
+        predictor = self._network.init(predictor_key, example)
+        return RNDState(self._network.init(target_key, example), predictor, ADAM.init(predictor))
+
+    def error(self, predictor: Any, target: Any, observation: jax.Array, action: jax.Array) -> jax.Array:
+        """Mean squared error over the features, [...]; the bonus is a coefficient times this."""
+        x = jnp.concatenate([observation, action], axis=-1)
+        fixed = jax.lax.stop_gradient(self._network.apply(target, x))
+        return jnp.mean((self._network.apply(predictor, x) - fixed) ** 2, axis=-1)
+
+    def update(self, state: RNDState, observation: jax.Array, action: jax.Array, learning_rate: Any) -> RNDState:
+        """One step of the predictor on rows[B]."""
+        grads = jax.grad(lambda p: jnp.mean(self.error(p, state.target, observation, action)))(state.predictor)
+        predictor, moments = adam_step(state.predictor, state.moments, grads, learning_rate)
+        return state.replace(predictor=predictor, moments=moments)

@@ -1,0 +1,169 @@
+"""From a recipe and a configuration to the phases of a run, and from a finished run to its agent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from qdos_brax import config as configs
+from qdos_brax.config import Config
+from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.device import DeviceData, Normaliser, to_device
+from qdos_brax.errors import UserError
+from qdos_brax.high_level.agent import Agent
+from qdos_brax.high_level.evaluation import evaluate
+from qdos_brax.high_level.latent_map import latent_map
+from qdos_brax.high_level.online_phase import OnlinePhase
+from qdos_brax.high_level.sac import SAC
+from qdos_brax.labels.label_phase import LabelPhase
+from qdos_brax.labels.offline_reward import DataReward, MinimumReward, OfflineReward, PredictedReward
+from qdos_brax.labels.reward_model import RewardModel
+from qdos_brax.methods import METHODS, Recipe
+from qdos_brax.population import over_members
+from qdos_brax.runs.checkpoint import CheckpointStore
+from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.loop import Phase
+from qdos_brax.skills.information import LoggedStates, PhysicsRollout
+from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, SegmentWeights, UniformWeights
+from qdos_brax.skills.skill_phase import Information, SkillPhase
+from qdos_brax.skills.vae import SkillModel
+from qdos_brax.skills.value_phase import ValuePhase
+from qdos_brax.skills.values import IQL
+
+
+def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
+    """The phases of ``config.method``, in order.
+
+    Args:
+        config: the run's configuration.
+        env: the task's environment, as ``envs.make`` gives it.
+        dataset: the data, labelled for that task.
+
+    Raises:
+        UserError: the data cannot serve this configuration.
+    """
+    recipe = METHODS[config.method]
+    data, normaliser = to_device(dataset, config.skills.horizon)
+    if data.starts.shape[0] == 0:
+        raise UserError(
+            f"no episode of {dataset.source} has {config.skills.horizon} steps, the length of a skill "
+            "(--set skills.horizon=N shortens it)"
+        )
+    if config.values.n_step > config.skills.horizon:
+        raise UserError(
+            f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({config.skills.horizon})"
+        )
+    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    model = _skill_model(config, env)
+    iql = IQL(env.observation_size, env.action_size, config.values.hidden)
+    weights = _weights(config, recipe, iql, env)
+    information = _information(config, recipe, env, model, normaliser, data)
+    labeller = _labeller(config, recipe, env)
+
+    values: list[Phase] = [ValuePhase(config, data, hyper, iql)] if recipe.weighted else []
+    return [
+        *values,
+        SkillPhase(config, data, hyper, model, weights, information),
+        LabelPhase(config, data, len(hyper["skills.alpha"]), model),
+        OnlinePhase(config, env, data, normaliser, hyper, model, labeller),
+    ]
+
+
+def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
+    """Plays whole episodes with the agents of a finished run.
+
+    Args:
+        run: the run folder.
+        episodes: episodes per member.
+
+    Returns:
+        One dict per member: seed, alpha, and whatever else varies, success (0..1), return, length, episodes.
+
+    Raises:
+        UserError: it is no run folder, or the run has not ended.
+    """
+    folder = RunFolder.open(str(run))
+    config = configs.from_yaml(folder.config)
+    if folder.read_summary() is None:
+        raise UserError(f"the run in {run} has not ended; go on with: python train.py --resume {run}")
+    env = envs.make(config.env, physics=config.physics)
+    phases = 4 if METHODS[config.method].weighted else 3
+    artifacts = CheckpointStore(folder.checkpoints, configs.config_hash(config)).artifacts(phases)
+    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    members = configs.members(config)
+    high = config.high_level
+    sac = SAC(env.observation_size, config.skills.latent_dim, high.hidden, high.ensemble, high.target_subset)
+    model = _skill_model(config, env)
+
+    def play(artifacts: Any, hyper: Any, key: jax.Array) -> Any:
+        agent = Agent(
+            normaliser=Normaliser(**artifacts["normaliser"]),
+            model=model,
+            sac=sac,
+            latent_map=latent_map(high.latent_map, hyper["skills.latent_box"]),
+            skills=artifacts["skills"],
+            actor=artifacts["actor"],
+        )
+        return evaluate(env, agent.choose, agent.play, key, episodes, config.skills.horizon)
+
+    # Starts that no training or evaluation of the run has seen: a key of its own, the same for every member.
+    result = jax.jit(over_members(play, len(members)))(artifacts, hyper, jax.random.key(2**32 - 1))
+    means = {
+        "success": np.asarray(result.success).mean(axis=-1),
+        "return": np.asarray(result.episode_return).mean(axis=-1),
+        "length": np.asarray(result.length).mean(axis=-1),
+    }
+    return [
+        {**member, **{name: float(value[index]) for name, value in means.items()}, "episodes": episodes}
+        for index, member in enumerate(members)
+    ]
+
+
+def _skill_model(config: Config, env: Any) -> SkillModel:
+    skills = config.skills
+    return SkillModel(
+        env.observation_size,
+        env.action_size,
+        skills.latent_dim,
+        skills.encoder_hidden,
+        skills.encoder_layers,
+        skills.decoder_hidden,
+        skills.prior_hidden,
+    )
+
+
+def _weights(config: Config, recipe: Recipe, iql: IQL, env: Any) -> SegmentWeights:
+    if not recipe.weighted:
+        return UniformWeights()
+    if config.skills.advantage != "latent":
+        return LoggedWeights()
+    return LatentWeights(
+        env.observation_size, config.skills.latent_dim, config.values.hidden, iql.value, config.skills.horizon
+    )
+
+
+def _information(
+    config: Config, recipe: Recipe, env: Any, model: SkillModel, normaliser: Normaliser, data: DeviceData
+) -> Information | None:
+    if not recipe.information:
+        return None
+    if config.skills.mi_rollout == "logged":
+        return LoggedStates(config.skills.horizon)
+    return PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
+
+
+def _labeller(config: Config, recipe: Recipe, env: Any) -> OfflineReward:
+    kind = recipe.offline_reward or config.labels.offline_reward
+    if kind == "data":
+        return DataReward()
+    model = RewardModel(env.observation_size + config.skills.latent_dim, config.labels.reward_hidden)
+    if kind == "pred":
+        return PredictedReward(model)
+    # Every environment step earns at least -1 on these tasks; the lowest macro reward is H of them, discounted.
+    discount = np.float32(np.mean(config.high_level.discount))
+    return MinimumReward(model, -float(np.sum(discount ** np.arange(config.skills.horizon))))

@@ -1,0 +1,63 @@
+"""Where the states of the mutual-information term come from: the simulator, or the log."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from brax.envs.base import Env, State
+
+from qdos_brax.data.device import DeviceData, Normaliser
+from qdos_brax.data.segments import window
+from qdos_brax.errors import UserError
+from qdos_brax.skills.vae import SkillModel
+
+
+class PhysicsRollout:
+    """Plays each skill in the simulator, from the logged simulator state at the start of its segment.
+
+    Args:
+        env: the task's environment; episode ends are ignored, a rollout always has H steps.
+        model: the skills.
+        normaliser: of observations.
+        horizon: H.
+        data: the data set, which must hold simulator states.
+
+    Raises:
+        UserError: it holds none.
+    """
+
+    def __init__(self, env: Env, model: SkillModel, normaliser: Normaliser, horizon: int, data: DeviceData) -> None:
+        if data.qpos is None or data.qvel is None:
+            raise UserError(
+                "the data set holds no qpos and qvel to start rollouts from; use --set skills.mi_rollout=logged"
+            )
+        self._env, self._model, self._normalise, self._horizon = env, model, normaliser, horizon
+
+    def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
+        """Normalised observations[B, H, obs] before each action of the rollouts."""
+
+        def one(qpos: jax.Array, qvel: jax.Array, skill: jax.Array) -> jax.Array:
+            def step(state: State, _: None) -> tuple[State, jax.Array]:
+                observation = self._normalise(state.obs)
+                return self._env.step(state, self._model.act(params, observation, skill)), observation
+
+            start = self._env.reset_to(qpos, qvel, self._env.goal_xy)
+            return jax.lax.scan(step, start, None, length=self._horizon)[1]
+
+        return jax.vmap(one)(data.qpos[starts], data.qvel[starts], latent)
+
+
+class LoggedStates:
+    """Decodes each skill along the logged states of its segment (DiveOff): no simulator.
+
+    Args:
+        horizon: H.
+    """
+
+    def __init__(self, horizon: int) -> None:
+        self._horizon = horizon
+
+    def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
+        """Normalised observations[B, H, obs] of the segments."""
+        return window(data.observations, starts, self._horizon)

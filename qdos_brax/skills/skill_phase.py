@@ -1,0 +1,169 @@
+"""The second phase: skills, by the weighted VAE and the mutual information between a skill and what it does."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+
+from qdos_brax.config import Config, SkillsConfig
+from qdos_brax.data.device import DeviceData, macro_rows
+from qdos_brax.data.segments import window
+from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.population import over_members
+from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
+from qdos_brax.skills.vae import Segments, SkillModel
+from qdos_brax.skills.weights import advantage_weights
+
+
+class Information(Protocol):
+    """Where the states of L_info come from."""
+
+    def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
+        """Normalised observations[B, H, obs] along which skill z_i is decoded, from the segments at starts[B]."""
+        ...
+
+
+class Rollout(NamedTuple):
+    """Random skills and where they led: observations[B, H, obs] (normalised), z[B, latent], segment weights[B]."""
+
+    observations: jax.Array
+    latent: jax.Array
+    weight: jax.Array
+
+
+@struct.dataclass
+class SkillPhaseState:
+    """What the phase carries, every leaf [members, ...]."""
+
+    key: jax.Array
+    params: Any
+    moments: optax.OptState
+    weights: Any
+    update: jax.Array
+
+
+class SkillPhase:
+    """The skill learner.
+
+    A block of ``mi_every`` gradient steps shares one batch of rollouts of random skills (none when ``information`` is
+    None): simulating is far dearer than a gradient step.
+
+    Args:
+        config: the run's configuration.
+        data: the data set on the device.
+        hyper: scannable numbers by dotted key, float32[members] each.
+        model: posterior, prior and decoder.
+        weights: where segment advantages come from.
+        information: where the states of the mutual-information term come from, or None to leave the term out.
+        blocks_per_chunk: blocks between two looks of the host.
+    """
+
+    name = "skills"
+    part = "pretrain"
+
+    def __init__(
+        self,
+        config: Config,
+        data: DeviceData,
+        hyper: dict[str, Any],
+        model: SkillModel,
+        weights: SegmentWeights,
+        information: Information | None,
+        blocks_per_chunk: int = 10,
+    ) -> None:
+        self._skills: SkillsConfig = config.skills
+        self._data, self._hyper = data, hyper
+        self._model, self._weights, self._information = model, weights, information
+        total_blocks = -(-self._skills.updates // self._skills.mi_every)
+        self._blocks = min(blocks_per_chunk, total_blocks)
+        self.num_chunks = -(-total_blocks // self._blocks)
+        self._chunk = jax.jit(over_members(self._train, len(hyper["skills.alpha"])), donate_argnums=0)
+
+    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> SkillPhaseState:
+        """Fresh networks for every member."""
+
+        def one(key: jax.Array) -> SkillPhaseState:
+            model_key, weights_key, key = jax.random.split(key, 3)
+            params = self._model.init(model_key)
+            return SkillPhaseState(
+                key, params, ADAM.init(params), self._weights.init(weights_key), jnp.zeros((), jnp.int32)
+            )
+
+        self._artifacts = {name: artifacts[name] for name in ("value", "advantage") if name in artifacts}
+        return jax.vmap(one)(key)
+
+    def chunk(self, state: SkillPhaseState) -> tuple[SkillPhaseState, dict[str, np.ndarray]]:
+        """``blocks_per_chunk`` x ``mi_every`` gradient steps."""
+        state, info = self._chunk(state, self._hyper, self._artifacts, self._data)
+        return state, {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+
+    def finish(self, state: SkillPhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
+        """Adds the skill model's parameters; the weights' own are done with."""
+        return artifacts | {"skills": state.params}
+
+    def _train(self, state: SkillPhaseState, hyper: Any, artifacts: Any, data: DeviceData) -> Any:
+        keys = jax.random.split(state.key, self._blocks + 1)
+        block = partial(self._block, data=data, hyper=hyper, artifacts=artifacts)
+        state, info = jax.lax.scan(block, state, keys[1:])
+        return state.replace(key=keys[0]), jax.tree.map(jnp.mean, info)
+
+    def _block(
+        self, state: SkillPhaseState, key: jax.Array, data: DeviceData, hyper: Any, artifacts: Any
+    ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
+        """One batch of rollouts, then ``mi_every`` gradient steps on it and on fresh segments."""
+        rollout_key, latent_key, update_key = jax.random.split(key, 3)
+        index = jax.random.randint(rollout_key, (self._skills.mi_batch,), 0, data.starts.shape[0])
+        shape = (self._skills.mi_batch, self._skills.latent_dim)
+        latent = hyper["skills.latent_box"] * jax.random.uniform(latent_key, shape, minval=-1.0)
+        rollout = None
+        if self._information is not None:
+            starts = data.starts[index]
+            observations = self._information(state.params, data, starts, latent)
+            weight = self._weight(state, self._batch(state, data, index, hyper), artifacts, hyper)
+            rollout = Rollout(observations, latent, weight)
+        update = partial(self._update, data=data, hyper=hyper, artifacts=artifacts, rollout=rollout)
+        return jax.lax.scan(update, state, jax.random.split(update_key, self._skills.mi_every))
+
+    def _update(
+        self, state: SkillPhaseState, key: jax.Array, data: DeviceData, hyper: Any, artifacts: Any, rollout: Any
+    ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
+        index_key, sample_key = jax.random.split(key)
+        index = jax.random.randint(index_key, (self._skills.batch_size,), 0, data.starts.shape[0])
+        batch = self._batch(state, data, index, hyper)
+        state = state.replace(weights=self._weights.learn(state.weights, batch, artifacts, hyper))
+        weight = self._weight(state, batch, artifacts, hyper)
+        segments = self._segments(data, index)
+
+        def loss(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+            total, info = self._model.vae_loss(
+                params, segments, weight, hyper["skills.kl_weight"], sample_key, self._skills.kl_weighted
+            )
+            if rollout is None:
+                return total, info
+            information_loss = self._model.information_loss(params, *rollout)
+            return total + hyper["skills.alpha"] * information_loss, info | {"information_loss": information_loss}
+
+        grads, info = jax.grad(loss, has_aux=True)(state.params)
+        params, moments = adam_step(state.params, state.moments, grads, hyper["skills.learning_rate"])
+        effective = jnp.sum(weight) ** 2 / jnp.sum(weight**2) / self._skills.batch_size
+        state = state.replace(params=params, moments=moments, update=state.update + 1)
+        return state, info | {"weight_ess": effective}
+
+    def _segments(self, data: DeviceData, index: jax.Array) -> Segments:
+        return Segments(*window((data.observations, data.actions), data.starts[index], self._skills.horizon))
+
+    def _batch(self, state: SkillPhaseState, data: DeviceData, index: jax.Array, hyper: Any) -> SegmentBatch:
+        rows = macro_rows(data, data.starts[index], self._skills.horizon, hyper["values.discount"])
+        return SegmentBatch(
+            index, rows, latent=lambda: self._model.encode(state.params, self._segments(data, index)).mean
+        )
+
+    def _weight(self, state: SkillPhaseState, batch: SegmentBatch, artifacts: Any, hyper: Any) -> jax.Array:
+        advantage = self._weights.advantage(state.weights, batch, artifacts)
+        return advantage_weights(advantage, hyper["skills.advantage_temperature"], hyper["skills.weight_clip"])

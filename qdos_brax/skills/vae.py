@@ -1,0 +1,138 @@
+"""The advantage-weighted trajectory VAE (paper, eq. 3 and Algorithm 1) and its mutual-information term (eq. 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from qdos_brax.networks import (
+    DiagonalGaussian,
+    SegmentEncoder,
+    gaussian_kl,
+    gaussian_log_prob,
+    gaussian_sample,
+)
+
+Params = Any
+
+
+class Segments(NamedTuple):
+    """Windows of the data: observations[B, H, obs] (normalised), actions[B, H, act]."""
+
+    observations: jax.Array
+    actions: jax.Array
+
+
+class Posterior(NamedTuple):
+    """The diagonal Gaussian q(z | tau): mean[B, z], log standard deviation[B, z]."""
+
+    mean: jax.Array
+    log_std: jax.Array
+
+
+class SkillModel:
+    """Posterior, state prior and decoder.
+
+    Args:
+        observation_dim: width of observations.
+        action_dim: width of actions.
+        latent_dim: dimension of z.
+        encoder_hidden: width of the bidirectional GRU.
+        encoder_layers: its number of layers.
+        decoder_hidden: hidden widths of the low-level policy.
+        prior_hidden: hidden widths of the state prior.
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        latent_dim: int,
+        encoder_hidden: int,
+        encoder_layers: int,
+        decoder_hidden: Sequence[int],
+        prior_hidden: Sequence[int],
+    ) -> None:
+        self.observation_dim, self.action_dim, self.latent_dim = observation_dim, action_dim, latent_dim
+        self._encoder = SegmentEncoder(encoder_hidden, encoder_layers, latent_dim)
+        self._prior = DiagonalGaussian(tuple(prior_hidden), latent_dim)
+        self._decoder = DiagonalGaussian(tuple(decoder_hidden), action_dim)
+
+    def init(self, key: jax.Array) -> dict[str, Params]:
+        """Fresh parameters: {"encoder", "prior", "decoder"}."""
+        encoder_key, prior_key, decoder_key = jax.random.split(key, 3)
+        observation, action = jnp.zeros((1, 2, self.observation_dim)), jnp.zeros((1, 2, self.action_dim))
+        return {
+            "encoder": self._encoder.init(encoder_key, observation, action),
+            "prior": self._prior.init(prior_key, observation[:, 0]),
+            "decoder": self._decoder.init(decoder_key, jnp.zeros((1, self.observation_dim + self.latent_dim))),
+        }
+
+    def encode(self, params: dict[str, Params], segments: Segments) -> Posterior:
+        """q(z | tau)."""
+        return Posterior(*self._encoder.apply(params["encoder"], segments.observations, segments.actions))
+
+    def prior(self, params: dict[str, Params], observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """p(z | s_0): (mean[..., z], log standard deviation[..., z])."""
+        return self._prior.apply(params["prior"], observation)
+
+    def decode(
+        self, params: dict[str, Params], observation: jax.Array, latent: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """pi(a | s, z): (mean[..., act], log standard deviation[..., act])."""
+        return self._decoder.apply(params["decoder"], jnp.concatenate([observation, latent], axis=-1))
+
+    def act(self, params: dict[str, Params], observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """The low-level policy's mean action[..., act], clipped to [-1, 1]."""
+        return jnp.clip(self.decode(params, observation, latent)[0], -1.0, 1.0)
+
+    def reconstruction(self, params: dict[str, Params], segments: Segments, latent: jax.Array) -> jax.Array:
+        """sum_t log pi(a_t | s_t, z), [B]."""
+        horizon = segments.actions.shape[1]
+        repeated = jnp.broadcast_to(latent[:, None], (latent.shape[0], horizon, latent.shape[1]))
+        mean, log_std = self.decode(params, segments.observations, repeated)
+        return jnp.sum(gaussian_log_prob(segments.actions, mean, log_std), axis=1)
+
+    def vae_loss(
+        self,
+        params: dict[str, Params],
+        segments: Segments,
+        weight: jax.Array,
+        kl_weight: jax.Array | float,
+        key: jax.Array,
+        kl_weighted: bool,
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """mean_i [ w_i or 1 ] beta KL(q || p) - w_i log-likelihood.
+
+        Args:
+            params: the model's parameters.
+            segments: windows, leading axis B.
+            weight: [B], mean about 1.
+            kl_weight: beta.
+            key: for the posterior sample.
+            kl_weighted: weight the KL as Algorithm 1 does (True) or not, as equation 4 does (False).
+        """
+        posterior = self.encode(params, segments)
+        latent = gaussian_sample(key, *posterior)
+        log_likelihood = self.reconstruction(params, segments, latent)
+        kl = gaussian_kl(*posterior, *self.prior(params, segments.observations[:, 0]))
+        kl_share = weight * kl if kl_weighted else kl
+        loss = jnp.mean(kl_weight * kl_share - weight * log_likelihood)
+        return loss, {"vae_loss": loss, "kl": jnp.mean(kl), "log_likelihood": jnp.mean(log_likelihood)}
+
+    def information_loss(
+        self, params: dict[str, Params], observations: jax.Array, latent: jax.Array, weight: jax.Array
+    ) -> jax.Array:
+        """mean_i w_i ||z_hat_i - z_i||^2, with z_hat the posterior mean of what skill z does (paper, eq. 5).
+
+        The actions are decoded anew along ``observations[B, H, obs]``, so that the gradient reaches the decoder
+        through them although the states carry none (they come from a rollout, or from the log).
+        """
+        observations = jax.lax.stop_gradient(observations)
+        repeated = jnp.broadcast_to(latent[:, None], (*observations.shape[:2], latent.shape[-1]))
+        actions = self.decode(params, observations, repeated)[0]
+        recovered = self.encode(params, Segments(observations, actions)).mean
+        return jnp.mean(weight * jnp.sum((recovered - latent) ** 2, axis=-1))

@@ -1,0 +1,125 @@
+"""The first phase: values of states, and from them the advantage of every segment of the data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from qdos_brax.config import Config, SkillsConfig, ValuesConfig
+from qdos_brax.data.device import DeviceData, macro_rows
+from qdos_brax.data.segments import macro_return, window
+from qdos_brax.population import over_members
+from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState
+from qdos_brax.skills.weights import segment_advantage, transition_advantage
+
+LABEL_BATCH = 2048
+
+
+@struct.dataclass
+class ValuePhaseState:
+    """What the phase carries, every leaf [members, ...]."""
+
+    key: jax.Array
+    values: ValueState
+    update: jax.Array
+
+
+class ValuePhase:
+    """IQL on the data set.
+
+    Args:
+        config: the run's configuration.
+        data: the data set on the device.
+        hyper: scannable numbers by dotted key, float32[members] each.
+        iql: the learner.
+        updates_per_chunk: gradient steps between two looks of the host.
+    """
+
+    name = "values"
+    part = "pretrain"
+
+    def __init__(
+        self, config: Config, data: DeviceData, hyper: dict[str, Any], iql: IQL, updates_per_chunk: int = 500
+    ) -> None:
+        self._values: ValuesConfig = config.values
+        self._skills: SkillsConfig = config.skills
+        self._data, self._hyper, self._iql = data, hyper, iql
+        self._updates = min(updates_per_chunk, config.values.updates)
+        self.num_chunks = -(-config.values.updates // self._updates)
+        members = len(hyper["values.discount"])
+        self._chunk = jax.jit(over_members(self._train, members), donate_argnums=0)
+        self._advantages = jax.jit(over_members(self._all_advantages, members))
+
+    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> ValuePhaseState:
+        """Fresh networks for every member."""
+
+        def one(key: jax.Array) -> ValuePhaseState:
+            init_key, key = jax.random.split(key)
+            return ValuePhaseState(key, self._iql.init(init_key), jnp.zeros((), jnp.int32))
+
+        return jax.vmap(one)(key)
+
+    def chunk(self, state: ValuePhaseState) -> tuple[ValuePhaseState, dict[str, np.ndarray]]:
+        """``updates_per_chunk`` gradient steps."""
+        state, info = self._chunk(state, self._hyper, self._data)
+        return state, {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+
+    def finish(self, state: ValuePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
+        """Adds the value function and the advantage of every segment, float32[members, S], in units of its spread."""
+        advantage = self._advantages(state, self._hyper, self._data)
+        return artifacts | {"value": state.values.value, "advantage": advantage}
+
+    def _train(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> Any:
+        value_hyper = ValueHyper(hyper["values.learning_rate"], hyper["values.expectile"], hyper["values.target_rate"])
+
+        def update(values: ValueState, key: jax.Array) -> tuple[ValueState, dict[str, jax.Array]]:
+            batch = sample_batch(data, key, self._values.batch_size, self._values.n_step, hyper["values.discount"])
+            return self._iql.update(values, batch, value_hyper)
+
+        keys = jax.random.split(state.key, self._updates + 1)
+        values, info = jax.lax.scan(update, state.values, keys[1:])
+        state = ValuePhaseState(keys[0], values, state.update + self._updates)
+        return state, jax.tree.map(jnp.mean, info)
+
+    def _all_advantages(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> jax.Array:
+        estimate = self.segment if self._skills.advantage == "segment" else self.transition
+        advantage = jax.lax.map(
+            lambda start: estimate(state.values, data, start[None], hyper["values.discount"])[0],
+            data.starts,
+            batch_size=LABEL_BATCH,
+        )
+        return advantage / (jnp.std(advantage) + 1e-6)
+
+    def segment(self, values: ValueState, data: DeviceData, starts: jax.Array, discount: jax.Array) -> jax.Array:
+        """sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of the windows at ``starts[B]``, [B]."""
+        horizon = self._skills.horizon
+        rows = macro_rows(data, starts, horizon, discount)
+        value_end = self._iql.value(values.value, rows.next_observation)
+        value_start = self._iql.value(values.value, rows.observation)
+        return segment_advantage(rows.reward, rows.mask * discount**horizon, value_end, value_start)
+
+    def transition(self, values: ValueState, data: DeviceData, starts: jax.Array, discount: jax.Array) -> jax.Array:
+        """mean_t [min Q(s_t, a_t) - V(s_t)] of the windows at ``starts[B]``, [B]."""
+        observations, actions = window((data.observations, data.actions), starts, self._skills.horizon)
+        q = self._iql.q(values.critic, observations, actions).min(axis=0)
+        return transition_advantage(q, self._iql.value(values.value, observations))
+
+
+def sample_batch(data: DeviceData, key: jax.Array, size: int, n_step: int, discount: jax.Array) -> ValueBatch:
+    """``size`` n-step transitions, uniform over the windows of the data.
+
+    ``n_step`` must not exceed the horizon for which ``data.starts`` were made.
+    """
+    starts = data.starts[jax.random.randint(key, (size,), 0, data.starts.shape[0])]
+    reward, mask = macro_return(*window((data.rewards, data.masks), starts, n_step), discount)
+    return ValueBatch(
+        observation=data.observations[starts],
+        action=data.actions[starts],
+        reward=reward,
+        discount=mask * discount**n_step,
+        next_observation=data.next_observations[starts + n_step - 1],
+    )

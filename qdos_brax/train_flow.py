@@ -1,0 +1,194 @@
+"""One run from flags to report: configuration, task, data, phases, curves. What each part does is elsewhere."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import envs
+from qdos_brax import config as configs
+from qdos_brax.config import Config
+from qdos_brax.data import cache, formats
+from qdos_brax.errors import UserError
+from qdos_brax.methods import METHODS
+from qdos_brax.methods.build import build_phases
+from qdos_brax.report.curves import draw_curves
+from qdos_brax.runs import compile_cache
+from qdos_brax.runs.folder import RunFolder, new_path, write_text
+from qdos_brax.runs.loop import run_phases
+
+_PACKAGES = ("brax", "flax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "orbax-checkpoint")
+
+
+def prepare_jax() -> None:
+    """Settings that must be made before jax is first used."""
+    # MuJoCo C is called back from compiled programs; with asynchronous dispatch on a CPU such a callback can wait for
+    # ever on arrays that wait for it (jax issue 25861). Long programs lose nothing by it; accelerators ignore it.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    compile_cache.enable()
+
+
+def start(make_config: Callable[[], Config], preset_given: bool, started: float) -> dict[str, Any]:
+    """A new run to its end.
+
+    Args:
+        make_config: reads the configuration; called once jax may be asked for its devices.
+        preset_given: whether the user named the preset; if not, the first lines say why it was taken.
+        started: ``time.perf_counter()`` at the process's start.
+
+    Returns:
+        The summary.
+
+    Raises:
+        UserError: a flag, a file or the disk is at fault.
+    """
+    prepare_jax()
+    asked = make_config()
+    _check_method(asked.method)
+    env = _make_env(asked)
+    resolved = configs.replace(asked, env=env.spec.full_name, physics=env.backend)
+    folder = RunFolder.create(asked.out or new_path(asked.run.root, f"{resolved.env}-{resolved.method}"))
+    resolved = configs.replace(resolved, out=str(folder.path))
+    with folder.held():
+        write_text(folder.config, configs.to_yaml(resolved))
+        _announce(resolved, asked, chosen=not preset_given)
+        return _run(resolved, env, folder, started)
+
+
+def resume(path: str, started: float) -> dict[str, Any]:
+    """Goes on with the run in ``path`` to its end.
+
+    Returns:
+        The summary.
+
+    Raises:
+        UserError: there is no run, another process works on it, or it cannot go on.
+    """
+    prepare_jax()
+    folder = RunFolder.open(path)
+    with folder.held():
+        summary = folder.read_summary()
+        if summary is not None:
+            print(f"{folder.path} has ended already")
+            _conclude(folder, summary)
+            return summary
+        config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
+        _check_method(config.method)
+        env = _make_env(config)
+        _announce(config, config, chosen=False)
+        return _run(config, env, folder, started)
+
+
+def _run(config: Config, env: Any, folder: RunFolder, started: float) -> dict[str, Any]:
+    before_data = time.perf_counter()
+    data_path = Path(config.dataset).expanduser() if config.dataset else _default_data(config, env)
+    print(f"data      {data_path}", flush=True)
+    dataset = formats.read(data_path, env)
+    _same_data(folder, data_path)
+    data_seconds = time.perf_counter() - before_data
+    summary = run_phases(
+        build_phases(config, env, dataset),
+        folder,
+        configs.members(config),
+        config=configs.config_hash(config),
+        header={"env": config.env, "method": config.method, "preset": config.preset, "physics": config.physics},
+        checkpoint_seconds=config.run.checkpoint_seconds,
+        data_seconds=data_seconds,
+        started=started,
+    )
+    draw_curves([folder.path], folder.curves)
+    _conclude(folder, summary)
+    return summary
+
+
+def _check_method(name: str) -> None:
+    if name not in METHODS:
+        raise UserError(
+            f"there is no method {name!r}{configs.nearest(name, list(METHODS))}; there are {', '.join(METHODS)}"
+        )
+
+
+def _make_env(config: Config) -> Any:
+    try:
+        return envs.make(config.env, physics=config.physics)
+    except ValueError as error:  # envs knows nothing of UserError; its lines are made for the user all the same
+        raise UserError(str(error)) from error
+
+
+def _default_data(config: Config, env: Any) -> Path:
+    """The task's default set, collected if it is not in the cache yet."""
+    data = config.data
+    return Path(
+        cache.default_dataset(
+            env,
+            transitions=data.transitions,
+            degraded_share=data.degraded_share,
+            noise=data.noise,
+            seed=data.seed,
+            num_envs=data.num_envs,
+        )
+    )
+
+
+def _same_data(folder: RunFolder, data_path: Path) -> None:
+    """Writes down what the run is made from; on resume, refuses other data than at the start."""
+    with data_path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if folder.provenance.exists():
+        earlier = json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]
+        if earlier["sha256"] != digest:
+            raise UserError(
+                f"{data_path} is not what the run began with (SHA-256 {digest[:12]}, then {earlier['sha256'][:12]})"
+            )
+        return
+    content = {
+        "command": sys.argv,
+        "dataset": {"path": str(data_path), "sha256": digest},
+        "python": platform.python_version(),
+        "packages": {name: metadata.version(name) for name in _PACKAGES},
+    }
+    write_text(folder.provenance, json.dumps(content, indent=2) + "\n")
+
+
+def _announce(config: Config, asked: Config, chosen: bool) -> None:
+    """The first lines: what runs, on what, from where to where."""
+    devices = jax.devices()
+    why = f" (jax sees {'no accelerator' if config.preset == 'cpu' else 'an accelerator'}; --preset says otherwise)"
+    alias = "" if asked.env == config.env else f" (asked for as {asked.env})"
+    engine = f"{config.physics}" + (" (chosen by hardware)" if asked.physics == "auto" else "")
+    print(f"task      {config.env}{alias}")
+    print(f"method    {config.method}, alpha {_list(config.skills.alpha)}, seed {_list(config.seed)}")
+    print(f"preset    {config.preset}{why if chosen else ''}")
+    print(f"physics   {engine}")
+    print(f"device    {len(devices)} x {devices[0].device_kind}, {len(os.sched_getaffinity(0))} CPU cores")
+    print(f"run       {config.out}", flush=True)
+
+
+def _conclude(folder: RunFolder, summary: dict[str, Any]) -> None:
+    """The last lines: how it went and where things are."""
+    minutes = summary["wall_seconds"]["total"] / 60
+    print(f"\ndone in {minutes:.1f} minutes")
+    for member in summary["members"]:
+        success = member["eval_success"]
+        result = "not evaluated" if success is None else f"success {success:.2f} (best {member['best_success']:.2f})"
+        first = member["first_goal_step"]
+        goal = "no goal reached" if first is None else f"first goal after {first:,} env steps"
+        state = "" if member["status"] == "ok" else ", FROZEN: its numbers were no longer finite"
+        print(f"  alpha {member['alpha']:g}, seed {member['seed']}: {result}, {goal}{state}")
+    print(f"summary   {folder.summary}")
+    print(f"curves    {folder.curves}")
+    print(f"evaluate  python -m qdos_brax evaluate {folder.path}", flush=True)
+
+
+def _list(values: Any) -> str:
+    return ", ".join(f"{value:g}" for value in (values if isinstance(values, tuple) else (values,)))

@@ -1,0 +1,49 @@
+"""AUC against a brute-force count; progress and the report by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from qdos_brax.data import quality
+from qdos_brax.data.dataset import Dataset
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_auc_equals_the_count_over_all_pairs(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scores = rng.integers(0, 6, 40).astype(float)  # many ties
+    positive = rng.random(40) < 0.4
+    pairs = [(p > n) + 0.5 * (p == n) for p in scores[positive] for n in scores[~positive]]
+    assert quality.auc(scores, positive) == pytest.approx(np.mean(pairs))
+
+
+def test_auc_of_one_kind_is_nan() -> None:
+    assert np.isnan(quality.auc(np.arange(3.0), np.ones(3, bool)))
+
+
+def test_progress_is_the_distance_gained_and_stays_in_the_episode() -> None:
+    qpos = np.array([[9.0], [7.0], [4.0], [100.0], [90.0], [80.0]], np.float32)
+    blank = np.zeros((6, 1), np.float32)
+    dataset = Dataset(
+        blank, blank, blank[:, 0], blank[:, 0], np.array([0, 0, 1, 0, 0, 1], bool), blank, qpos=qpos, source="toy"
+    )
+    env = SimpleNamespace(true_distance=lambda q: q[:, 0])
+    gains = quality.progress(env, dataset, np.array([0, 1, 3, 4]), 2)
+    np.testing.assert_allclose(gains, [5.0, 3.0, 20.0, 10.0])
+
+
+def test_report_by_hand() -> None:
+    gains = np.array([3.0, 2.0, -2.0, 0.0])
+    numbers = quality.report(
+        scores=np.array([2.0, 0.0, 1.0, 5.0]),
+        weights=np.array([2.0, 1.0, 1.0, 0.0]),
+        gains=gains,
+        degraded=np.array([False, False, True, True]),
+    )
+    assert numbers["auc_progress"] == pytest.approx(0.5)
+    assert numbers["auc_degraded"] == pytest.approx(0.25)
+    assert numbers["effective_share"] == pytest.approx(16 / 6 / 4)
+    assert numbers["losing_weight"] == pytest.approx(0.25)
+    assert numbers["gaining_weight"] == pytest.approx(0.75)
+    assert numbers["losing_share"] == pytest.approx(0.25)
