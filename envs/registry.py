@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Callable, Mapping, Sequence
 
 from envs import locomotion, soccer
 from envs.physics import resolve_physics
@@ -11,7 +12,12 @@ from envs.task import TaskEnv, TaskSpec
 
 ALIASES = {"antmaze": "antmaze-large", "antsoccer": "antsoccer-arena"}
 
-_FAMILIES = {"antmaze": (locomotion.AntMaze, locomotion.TASKS), "antsoccer": (soccer.AntSoccer, soccer.TASKS)}
+_Family = tuple[Callable[[TaskSpec, str], TaskEnv], Mapping[str, Sequence[object]]]  # class, cells of the tasks
+
+_FAMILIES: dict[str, _Family] = {
+    "antmaze": (locomotion.AntMaze, locomotion.TASKS),
+    "antsoccer": (soccer.AntSoccer, soccer.TASKS),
+}
 _DEFAULT_TASK = {"antmaze": 1, "antsoccer": 4}  # as OGBench's single-task mode
 _EPISODE_LENGTH = 1000
 

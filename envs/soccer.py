@@ -10,7 +10,6 @@ from envs.task import TaskEnv, TaskSpec
 Cell = tuple[int, int]
 
 BALL_QPOS = 15  # the ball's x; the ant's 15 come first
-BALL_QVEL = 14
 
 # Start cell of the ant, start cell of the ball, goal cell of task 1 to 5 (OGBench 1.2.2).
 TASKS: dict[str, list[tuple[Cell, Cell, Cell]]] = {

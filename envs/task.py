@@ -1,7 +1,8 @@
-"""What all maze tasks share: reset noise, success, reward, termination, cap. Semantics of OGBench's single-task mode."""
+"""What all maze tasks share: reset noise, success, reward, termination, cap, as OGBench's single-task mode has them."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -100,7 +101,7 @@ class TaskEnv(Env):
         """A start of the task; ``rng`` is a typed key."""
         qpos_key, qvel_key, place_key, next_key = jax.random.split(rng, 4)
         noise = jax.random.uniform(qpos_key, self._init_qpos.shape, minval=-RESET_NOISE, maxval=RESET_NOISE)
-        qpos = self._init_qpos + noise
+        qpos = jnp.asarray(self._init_qpos) + noise
         qvel = RESET_NOISE * jax.random.normal(qvel_key, (self.engine.nv,))
         shifts = jax.random.uniform(place_key, self._start_xy.shape, minval=-START_NOISE, maxval=START_NOISE)
         for index, xy in zip(self._tracked, self._start_xy + shifts, strict=True):
@@ -155,7 +156,7 @@ class TaskEnv(Env):
         """float64[...], shortest-path length left to the task's goal from ``qpos[..., nq]``; for measuring only."""
         qpos = np.asarray(qpos)
         points = [qpos[..., index : index + 2] for index in self._tracked] + [self.goal_xy]
-        legs = [self.layout.distance(a, b) for a, b in zip(points[:-1], points[1:], strict=True)]
+        legs = [self.layout.distance(a, b) for a, b in itertools.pairwise(points)]
         return np.sum(legs, axis=0)
 
 

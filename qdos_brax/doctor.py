@@ -10,10 +10,10 @@ import sys
 from collections.abc import Callable
 from importlib import metadata
 
+from qdos_brax import __version__
 from qdos_brax.runs import compile_cache
 
 _PACKAGES = (
-    "qdos-brax",
     "brax",
     "jax",
     "jaxlib",
@@ -75,7 +75,7 @@ def _packages() -> tuple[bool, str]:
             missing.append(name)
     if missing:
         return False, f"packages: {', '.join(missing)} not installed; run: pip install -c constraints.txt -e ."
-    return True, f"packages: {', '.join(found)}"
+    return True, f"packages: qdos-brax {__version__}, {', '.join(found)}"
 
 
 def _devices() -> tuple[bool, str]:
@@ -100,7 +100,7 @@ def _compile_cache() -> tuple[bool, str]:
 def _data() -> tuple[bool, str]:
     from qdos_brax.data import cache
 
-    folder = cache.data_folder()
+    folder = cache.folder()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(there).free / 2**30
     good = os.access(there, os.W_OK)

@@ -55,11 +55,14 @@ def start(make_config: Callable[[], Config], preset_given: bool, started: float)
     prepare_jax()
     asked = make_config()
     _check_method(asked.method)
+    if asked.dataset and not Path(asked.dataset).expanduser().exists():
+        raise UserError(f"{asked.dataset}: no such file")
     env = _make_env(asked)
     resolved = configs.replace(asked, env=env.spec.full_name, physics=env.backend)
     folder = RunFolder.create(asked.out or new_path(asked.run.root, f"{resolved.env}-{resolved.method}"))
     resolved = configs.replace(resolved, out=str(folder.path))
     with folder.held():
+        folder.provenance.unlink(missing_ok=True)  # of an attempt in the same folder that ended before training
         write_text(folder.config, configs.to_yaml(resolved))
         _announce(resolved, asked, chosen=not preset_given)
         return _run(resolved, env, folder, started)

@@ -25,13 +25,13 @@ def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
         maze: its walls are added; None leaves an open floor, without target.
         ball: add the soccer ball (a free body after the ant's).
     """
-    tree = ET.parse(_ANT)
-    world = _find(tree, ".//worldbody")
+    root = ET.parse(_ANT).getroot()
+    world = _find(root, "worldbody")
     if maze is not None:
-        _add_walls(tree, world, maze)
+        _add_walls(world, maze)
     if ball:
         _add_ball(world)
-    return mujoco.MjModel.from_xml_string(ET.tostring(tree.getroot(), encoding="unicode"))
+    return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 
 def near_walls_model(ball: bool = False) -> mujoco.MjModel:
@@ -44,18 +44,17 @@ def near_walls_model(ball: bool = False) -> mujoco.MjModel:
     - At most 12 contacts per dimension, the deepest; 8 solver and 12 line-search iterations. MJX finds a numeric's
       value by index, not by address, so that this one has to come before any longer one.
     """
-    tree = ET.parse(_ANT)
-    root = tree.getroot()
+    root = ET.parse(_ANT).getroot()
     custom = ET.SubElement(root, "custom")
     ET.SubElement(custom, "numeric", name="max_contact_points", data="12")
-    option = _find(tree, "option")
+    option = _find(root, "option")
     option.set("iterations", "8")
     option.set("ls_iterations", "12")
-    world = _find(tree, ".//worldbody")
-    for geom in _find(tree, ".//body[@name='torso']").iter("geom"):
+    world = _find(root, "worldbody")
+    for geom in _find(world, "body[@name='torso']").iter("geom"):
         geom.set("contype", str(_ANT_BIT | _KICK_BIT))
         geom.set("conaffinity", "0")
-    floor = _find(tree, ".//geom[@name='floor']")
+    floor = _find(world, "geom[@name='floor']")
     floor.set("contype", "0")
     floor.set("conaffinity", str(_ANT_BIT | _BALL_BIT))
     if ball:
@@ -79,7 +78,7 @@ def _add_ball(world: ET.Element) -> ET.Element:
     )
 
 
-def _add_walls(tree: ET.ElementTree, world: ET.Element, maze: Maze) -> None:
+def _add_walls(world: ET.Element, maze: Maze) -> None:
     half_x, half_y, half_z = WALL_HALF_SIZE
     rows, columns = maze.grid.shape
     for i in range(rows):
@@ -97,15 +96,15 @@ def _add_walls(tree: ET.ElementTree, world: ET.Element, maze: Maze) -> None:
                     conaffinity="1",
                     material="wall",
                 )
-    floor = _find(tree, ".//geom[@name='floor']")
+    floor = _find(world, "geom[@name='floor']")
     floor.set("pos", f"{2 * (columns - 3)} {2 * (rows - 3)} 0")
     floor.set("size", f"{2 * columns} {2 * rows} 0.2")
     target = {"name": "target", "type": "cylinder", "size": ".5 .05", "pos": "0 0 .05", "material": "target"}
     ET.SubElement(world, "geom", target, contype="0", conaffinity="0")
 
 
-def _find(tree: ET.ElementTree, path: str) -> ET.Element:
-    element = tree.find(path)
+def _find(parent: ET.Element, path: str) -> ET.Element:
+    element = parent.find(path)
     if element is None:
         raise ValueError(f"ant.xml has no element {path}")
     return element

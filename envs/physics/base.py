@@ -8,8 +8,7 @@ import jax
 from flax import struct
 
 
-@struct.dataclass
-class PipelineState:
+class PipelineState(struct.PyTreeNode):
     """The simulator's state between two control steps.
 
     Attributes:

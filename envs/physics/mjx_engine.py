@@ -17,11 +17,13 @@ from mujoco import mjx
 from envs.maze import UNIT, WALL_HALF_SIZE, Maze
 from envs.models import near_walls_model
 from envs.physics.base import PipelineState
-from envs.physics.frames import exact_frames
+from envs.physics.contacts import exact_contacts
 
 _SUNK = -10.0  # height of a box that stands for no wall: below the floor, out of reach
 _BALL_QPOS = 15
-_BALL_QVEL = 14
+
+_Substep = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, warm start
+_Stage = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # rate and acceleration of a stage, their means so far
 
 # Runge-Kutta of order 4: where each stage is evaluated, and its share.
 _STAGES = np.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], np.float32)
@@ -64,10 +66,10 @@ class MjxEngine:
         for b in self._bodies:
             shift = shift.at[b : b + 2].set(origin)
 
-        def substep(carry: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], None]:
+        def substep(carry: _Substep, _: None) -> tuple[_Substep, None]:
             return self._substep(*carry, walls, action), None
 
-        start = (state.qpos - shift, state.qvel, state.carry)
+        start: _Substep = (state.qpos - shift, state.qvel, state.carry)
         qpos, qvel, warmstart = jax.lax.scan(substep, start, None, length=self._frame_skip)[0]
         return PipelineState(qpos + shift, qvel, warmstart)
 
@@ -84,7 +86,7 @@ class MjxEngine:
 
     def _substep(
         self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, walls: jax.Array, action: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    ) -> _Substep:
         """One sub-step by RK4; returns the next (qpos, qvel, warm start).
 
         As MuJoCo C from 4.0 on, which turns quaternions by Munthe-Kaas' method: the rotation over the step is the
@@ -93,7 +95,7 @@ class MjxEngine:
         """
         dt = self.model.opt.timestep
 
-        def stage(carry: tuple[jax.Array, ...], coefficients: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
+        def stage(carry: _Stage, coefficients: jax.Array) -> tuple[_Stage, None]:
             rate, qacc, mean_rate, mean_qacc = carry  # rate: qvel with corrected rotations
             at, share = coefficients
             motion = at * dt * rate
@@ -103,7 +105,7 @@ class MjxEngine:
             return (rate, qacc, mean_rate + share * rate, mean_qacc + share * qacc), None
 
         zero = jnp.zeros_like(qvel)
-        _, last_qacc, mean_rate, mean_qacc = jax.lax.scan(stage, (zero, zero, zero, zero), _STAGES)[0]
+        _, last_qacc, mean_rate, mean_qacc = jax.lax.scan(stage, (zero, zero, zero, zero), jnp.asarray(_STAGES))[0]
         return self._integrate(qpos, dt * mean_rate), qvel + dt * mean_qacc, last_qacc
 
     def _correct_rotations(self, motion: jax.Array, qvel: jax.Array) -> jax.Array:
@@ -122,7 +124,7 @@ class MjxEngine:
         self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, walls: jax.Array, action: jax.Array
     ) -> jax.Array:
         data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=action, mocap_pos=walls)
-        with exact_frames():
+        with exact_contacts(), jax.default_matmul_precision("highest"):  # never TF32
             return mjx.forward(self._mjx_model, data).qacc
 
     def _integrate(self, qpos: jax.Array, motion: jax.Array) -> jax.Array:
@@ -151,5 +153,3 @@ def _rotate(quat: jax.Array, turn: jax.Array) -> jax.Array:
         ]
     )
     return product / jnp.sqrt(jnp.sum(product * product))
-
-

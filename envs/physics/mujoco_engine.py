@@ -20,8 +20,7 @@ from mujoco.batch import Batch
 from envs.physics.base import PipelineState
 
 
-@struct.dataclass
-class MujocoCarry:
+class MujocoCarry(struct.PyTreeNode):
     """The exact state.
 
     Attributes:

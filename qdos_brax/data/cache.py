@@ -48,12 +48,12 @@ def default_dataset(
     policy = walker.load()
     parameters = f"n{transitions}-bad{degraded_share:g}-noise{noise:g}-seed{seed}-envs{num_envs}"
     version = f"{env.backend}-v{collect.RECIPE}-{_digest(policy.params)}"
-    path = folder() / f"{env.spec.name}-{parameters}-{version}.hdf5"
+    path = folder() / f"{collect.data_name(env)}-{parameters}-{version}.hdf5"
     if path.exists():
         return path
     with _locked(path):
         if not path.exists():  # another process may have made it while this one waited
-            print(f"no data for {env.spec.name} yet: collecting {transitions:,} transitions into {path}", flush=True)
+            print(f"no data for {collect.data_name(env)} yet: collecting {transitions:,} steps into {path}", flush=True)
             make_file(path, env, transitions, degraded_share, noise, seed, num_envs, policy)
     return path
 
@@ -93,7 +93,9 @@ def _locked(path: Path) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = open(path.with_suffix(".lock"), "w")  # noqa: SIM115 (closed below)
     except OSError as error:
-        raise UserError(f"{path.parent} cannot be written ({error.strerror}); set QDOS_DATA to another folder") from None
+        raise UserError(
+            f"{path.parent} cannot be written ({error.strerror}); set QDOS_DATA to another folder"
+        ) from None
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -2,7 +2,8 @@
 
 An episode starts at random free cells and runs for a fixed number of steps, whatever it reaches: the ant is sent to a
 random free cell along a shortest path (soccer: it brings the ball there), and on arrival to another. It is the same
-data for every task of a maze; only rewards and masks are the task's.
+data for every task of a maze; only rewards and masks are the task's. A ball goes slowly and its goal is the
+cheapest of a few random cells: short ways that are finished show more than long ones that are not.
 
 Degraded episodes are as likely one of three kinds: ``noisy`` navigates under heavy action noise, ``wander`` walks in
 random directions, ``fail`` turns round half-way and undoes what it did (soccer: brings the ball back).
@@ -25,9 +26,9 @@ from envs.task import GOAL_TOLERANCE, START_NOISE, TaskEnv
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
 from qdos_brax.experts import walker
-from qdos_brax.experts.steering import Navigator, dribble_direction, maze_direction
+from qdos_brax.experts.steering import Navigator, dribble_cost, dribble_direction, maze_direction
 
-RECIPE = 1
+RECIPE = 3
 """Version of what is collected; part of the cache's file names."""
 
 HEAVY_NOISE = 1.0  # standard deviation of action noise in noisy episodes
@@ -40,11 +41,13 @@ CHECK_STEPS = 60
 ESCAPE_STEPS = 30
 STUCK_MOVE = 0.5  # m within CHECK_STEPS, of the ant, or of a ball it is at
 AT_BALL = 2.0  # m
+BALL_GOAL_DRAWS = 6  # a ball's goal is the cheapest of so many random free cells
+TASK_SHARE = 0.5  # in soccer: of the starts, those near the task's goal; of the goals drawn, those that are the task's
+NEAR_GOAL = 4.5  # m, from the goal's cell to its neighbours
 PATIENCE = 200  # steps after which a failing attempt turns round in any case
 
 
-@struct.dataclass
-class Lane:
+class Lane(struct.PyTreeNode):
     """One environment while collecting. The cargo is what has to reach the goal: the ant, or in soccer the ball.
 
     Attributes:
@@ -103,8 +106,8 @@ def collect(
         raise UserError(f"transitions must be at least {SHORTEST_EPISODE} (one episode), got {transitions}")
     if not 0.0 <= degraded_share <= 1.0:
         raise UserError(f"the degraded share must lie in [0, 1], got {degraded_share}")
-    if noise < 0.0 or num_envs < 1:
-        raise UserError(f"noise must be 0 or more and num_envs 1 or more, got {noise} and {num_envs}")
+    if noise < 0.0 or num_envs < 1 or seed < 0:
+        raise UserError(f"noise and seed must be 0 or more, num_envs 1 or more; got {noise}, {seed}, {num_envs}")
     length = _episode_length(transitions, num_envs, env.episode_length)
     episodes = -(-transitions // length)
     rounds = -(-episodes // num_envs)
@@ -123,6 +126,11 @@ def collect(
     rows["rewards"] = success.astype(np.float32) - 1.0
     rows["terminals"] = np.zeros(transitions, bool)
     return rows
+
+
+def data_name(env: TaskEnv) -> str:
+    """What a default set is called: soccer's depends on the task, a maze's does not."""
+    return env.spec.full_name if env.spec.family == "antsoccer" else env.spec.name
 
 
 class Collector:
@@ -197,11 +205,11 @@ class Collector:
         start = self.env.reset(reset_key).pipeline_state
         qpos = start.qpos.at[:2].set(self._start_xy(ant_key))
         if self.has_ball:
-            qpos = qpos.at[BALL_QPOS : BALL_QPOS + 2].set(self._start_xy(ball_key))
+            qpos = qpos.at[BALL_QPOS : BALL_QPOS + 2].set(self._ball_xy(ball_key))
         ant, cargo = self._positions(qpos)
         return Lane(
             pipeline=self.env.engine.init(qpos, start.qvel),
-            goal_xy=self.navigator.random_free_xy(goal_key),
+            goal_xy=self._goal_xy(goal_key, ant, cargo),
             origin_xy=cargo,
             turned=jnp.zeros((), bool),
             attempt=jnp.zeros((), jnp.int32),
@@ -217,6 +225,25 @@ class Collector:
         cell_key, shift_key = jax.random.split(key)
         shift = jax.random.uniform(shift_key, (2,), minval=-START_NOISE, maxval=START_NOISE)
         return self.navigator.random_free_xy(cell_key) + shift
+
+    def _ball_xy(self, key: jax.Array) -> jax.Array:
+        """Where a ball starts: TASK_SHARE of them in the task's goal's cell or beside it, the others anywhere."""
+        share_key, cell_key, shift_key, anywhere_key = jax.random.split(key, 4)
+        gap = jnp.linalg.norm(self.navigator.free_xy - self.env.goal_xy, axis=-1)
+        beside = self.navigator.free_xy[jax.random.categorical(cell_key, jnp.where(gap < NEAR_GOAL, 0.0, -jnp.inf))]
+        near = beside + jax.random.uniform(shift_key, (2,), minval=-START_NOISE, maxval=START_NOISE)
+        return jnp.where(jax.random.uniform(share_key) < TASK_SHARE, near, self._start_xy(anywhere_key))
+
+    def _goal_xy(self, key: jax.Array, ant: jax.Array, cargo: jax.Array) -> jax.Array:
+        """The centre[2] of a random free cell; of a ball the task's goal, or the cheapest of several (dribble_cost)."""
+        if not self.has_ball:
+            return self.navigator.random_free_xy(key)
+        share_key, draw_key = jax.random.split(key)
+        draws = jax.vmap(self.navigator.random_free_xy)(jax.random.split(draw_key, BALL_GOAL_DRAWS))
+        cheapest = draws[jnp.argmin(jax.vmap(partial(dribble_cost, self.navigator, ant, cargo))(draws))]
+        is_there = jnp.linalg.norm(cargo - self.env.goal_xy) < 2 * GOAL_TOLERANCE
+        takes_the_tasks = (jax.random.uniform(share_key) < TASK_SHARE) & ~is_there
+        return jnp.where(takes_the_tasks, self.env.goal_xy, cheapest)
 
     def _positions(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         """xy[2] of the ant and of the cargo."""
@@ -255,7 +282,7 @@ class Collector:
         redraw = undone | stuck | (~lane.turned & (gap < GOAL_TOLERANCE))
         wander_turns = jax.random.uniform(turn_key) < 1 / WANDER_STEPS
         return lane.replace(
-            goal_xy=jnp.where(redraw, self.navigator.random_free_xy(goal_key), lane.goal_xy),
+            goal_xy=jnp.where(redraw, self._goal_xy(goal_key, ant, cargo), lane.goal_xy),
             origin_xy=jnp.where(redraw, cargo, lane.origin_xy),
             turned=jnp.where(redraw, False, lane.turned | turns),
             attempt=jnp.where(redraw | turns, 0, lane.attempt),
@@ -270,7 +297,9 @@ class Collector:
         """bool: since the last check the ant hardly moved, or the ball did not though the ant was at it all along."""
         still = jnp.linalg.norm(ant - lane.seen_ant) < STUCK_MOVE
         ball_still = jnp.linalg.norm(cargo - lane.seen_cargo) < STUCK_MOVE
-        at_ball = (jnp.linalg.norm(ant - cargo) < AT_BALL) & (jnp.linalg.norm(lane.seen_ant - lane.seen_cargo) < AT_BALL)
+        at_ball = (jnp.linalg.norm(ant - cargo) < AT_BALL) & (
+            jnp.linalg.norm(lane.seen_ant - lane.seen_cargo) < AT_BALL
+        )
         return still | (ball_still & at_ball) if self.has_ball else still
 
     def _direction(self, lane: Lane, kind: jax.Array) -> jax.Array:

@@ -11,8 +11,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.segments import macro_return, segment_starts, window
 
 
-@struct.dataclass
-class Normaliser:
+class Normaliser(struct.PyTreeNode):
     """Fixed statistics of the data: x -> (x - mean) / scale.
 
     Attributes:
@@ -28,8 +27,7 @@ class Normaliser:
         return (observation - self.mean) / self.scale
 
 
-@struct.dataclass
-class DeviceData:
+class DeviceData(struct.PyTreeNode):
     """N transitions as device arrays; observations are normalised, rewards and masks are the task's.
 
     Attributes:
@@ -53,8 +51,7 @@ class DeviceData:
     qvel: jax.Array | None
 
 
-@struct.dataclass
-class MacroRows:
+class MacroRows(struct.PyTreeNode):
     """Windows seen as macro transitions, leading axis B: reward is the discounted sum over the live steps."""
 
     observation: jax.Array

@@ -6,6 +6,7 @@ Rewards and masks are the task's own wherever the file has the simulator's posit
 
 from __future__ import annotations
 
+import contextlib
 import os
 import zipfile
 from collections.abc import Mapping
@@ -112,7 +113,8 @@ def write_hdf5(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], a
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error}") from None
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink()
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:

@@ -15,11 +15,11 @@ from envs.maze import UNIT, Maze
 _CORRIDOR = 1.2  # m to either side of a straight line that must be free: the reach of the ant's legs
 
 # The dribble: round the ball on a circle that the legs do not touch it from, then through it; lengths in m.
-_CIRCLE = 1.6  # radius of the circle
-_PULL = 1.0  # turn towards the circle per m beside it
-_LANE = 0.4  # half width of the lane behind the ball in which the ant pushes
-_FUNNEL = 0.3  # the lane widens by this much per m behind the ball
-_STEER = 1.0  # turn of the push per m of lateral offset
+_CIRCLE = 2.0  # radius of the circle
+_PULL = 1.1  # turn towards the circle per m beside it
+_LANE = 0.8  # half width of the lane behind the ball in which the ant pushes
+_FUNNEL = 0.75  # the lane widens by this much per m behind the ball
+_STEER = 2.0  # turn of the push per m of lateral offset
 
 
 class Navigator:
@@ -33,6 +33,7 @@ class Navigator:
         self.maze = maze
         self.next_cell = jnp.asarray(maze.next_step_table)  # int32[C, C], the neighbour to enter, from row to column
         self.sight_cell = jnp.asarray(_farthest_in_sight(maze))  # int32[C, C], the last cell a straight walk reaches
+        self._free = jnp.asarray(maze.grid.reshape(-1) == 0)
         self.free_xy = jnp.asarray(maze.ij_to_xy(maze.free_cells), jnp.float32)  # float32[F, 2]
 
     def cell(self, xy: jax.Array) -> jax.Array:
@@ -42,6 +43,10 @@ class Navigator:
     def centre(self, cell: jax.Array) -> jax.Array:
         """float32[..., 2], the centre of ``cell[...]``."""
         return self.maze.index_to_xy(cell)
+
+    def is_free(self, xy: jax.Array) -> jax.Array:
+        """bool[...], whether ``xy[..., 2]`` lies in a free cell."""
+        return self._free[self.cell(xy)]
 
     def random_free_xy(self, key: jax.Array) -> jax.Array:
         """The centre[2] of a free cell, uniformly drawn."""
@@ -75,11 +80,29 @@ def dribble_direction(maze: Navigator, agent_xy: jax.Array, ball_xy: jax.Array, 
     round_it = side * jnp.stack([-outward[1], outward[0]])  # the way along the circle that leads behind the ball
     approach = unit_vector(round_it + _PULL * (_CIRCLE - distance) * outward)
     behind = (along < 0.0) & (jnp.abs(aside) < _LANE - _FUNNEL * along)
-    near = jnp.where(behind, push, approach)
+    near = jnp.where(behind, push, slide_along_walls(maze, agent_xy, approach))
 
     meeting = maze.sight_cell[here, ball]
     in_sight = (here == ball) | (meeting == ball)
     return jnp.where(in_sight, near, unit_vector(maze.centre(meeting) - agent_xy))
+
+
+def dribble_cost(maze: Navigator, agent_xy: jax.Array, ball_xy: jax.Array, goal_xy: jax.Array) -> jax.Array:
+    """How far, in m, the ant walks to the spot behind the ball and then with it; much more where a wall is in the way.
+
+    A goal at which the ball lies already costs as much as one that needs a spot inside a wall.
+    """
+    way = goal_xy - ball_xy
+    spot = ball_xy - _CIRCLE * unit_vector(way)
+    gap = jnp.linalg.norm(way)
+    useless = ~maze.is_free(spot) | (gap < 1.0)
+    return gap + jnp.linalg.norm(spot - agent_xy) + jnp.where(useless, 1e3, 0.0)
+
+
+def slide_along_walls(maze: Navigator, xy: jax.Array, direction: jax.Array) -> jax.Array:
+    """``direction[2]`` without its component into a wall that the legs would touch."""
+    probes = xy + _CORRIDOR * jnp.diag(jnp.sign(direction))
+    return unit_vector(jnp.where(maze.is_free(probes), direction, 0.0) + 1e-3 * direction)
 
 
 def unit_vector(vector: jax.Array) -> jax.Array:

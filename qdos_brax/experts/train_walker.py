@@ -39,8 +39,7 @@ class Sizes(NamedTuple):
     steps_per_chunk: int = 50
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """Everything the loop carries."""
 
     sac: SACState

@@ -90,10 +90,10 @@ class WalkerPolicy:
 def save(path: Path, hidden: tuple[int, ...], params: Any, facts: dict[str, Any]) -> None:
     """Writes the weights as plain arrays with a JSON header (how they were trained, what they reach), atomically."""
     flat = {"/".join(k): np.asarray(v) for k, v in traverse_util.flatten_dict(params).items()}
-    header = json.dumps({"hidden": list(hidden), **facts})
+    flat["header"] = np.frombuffer(json.dumps({"hidden": list(hidden), **facts}).encode(), np.uint8)
     temporary = path.with_name(path.name + ".tmp")
     with open(temporary, "wb") as file:
-        np.savez_compressed(file, header=np.frombuffer(header.encode(), np.uint8), **flat)
+        np.savez_compressed(file, allow_pickle=False, **flat)
     temporary.replace(path)
 
 

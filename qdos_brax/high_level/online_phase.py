@@ -29,8 +29,7 @@ from qdos_brax.skills.vae import SkillModel
 NEVER = -1
 
 
-@struct.dataclass
-class OnlineRow:
+class OnlineRow(struct.PyTreeNode):
     """A macro transition of the replay; observations are normalised."""
 
     observation: jax.Array
@@ -40,8 +39,7 @@ class OnlineRow:
     next_observation: jax.Array
 
 
-@struct.dataclass
-class Learners:
+class Learners(struct.PyTreeNode):
     """Everything that learns online."""
 
     sac: SACState
@@ -49,8 +47,7 @@ class Learners:
     labeller: Any
 
 
-@struct.dataclass
-class OnlinePhaseState:
+class OnlinePhaseState(struct.PyTreeNode):
     """What the phase carries, every leaf [members, ...].
 
     Attributes:
@@ -304,8 +301,9 @@ class OnlinePhase:
         online = replay_buffer.sample(replay, online_key, self._config.high_level.batch_size - self._offline)
         index = jax.random.randint(offline_key, (self._offline,), 0, data.starts.shape[0])
         action = self._latent_map(hyper).to_action(frozen["labels"][index])
-        rows = macro_rows(data, data.starts[index], self._horizon, hyper["high_level.discount"])
-        reward, mask = self._labeller.label(learners.labeller, rows, action)
+        discount = hyper["high_level.discount"]
+        rows = macro_rows(data, data.starts[index], self._horizon, discount)
+        reward, mask = self._labeller.label(learners.labeller, rows, action, discount)
         offline = OnlineRow(rows.observation, action, reward, mask, rows.next_observation)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), offline, online)
         bonus = self._bonus(learners.rnd, both.observation, both.action, hyper)

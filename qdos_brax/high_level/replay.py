@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 
-@struct.dataclass
-class Replay:
+class Replay(struct.PyTreeNode):
     """The buffer.
 
     Attributes:

@@ -29,8 +29,7 @@ class Batch(NamedTuple):
     next_observation: jax.Array
 
 
-@struct.dataclass
-class SACHyper:
+class SACHyper(struct.PyTreeNode):
     """Numbers a scan may vary: learning rate, discount per transition, Polyak rate, target entropy (nats)."""
 
     learning_rate: jax.Array | float
@@ -39,8 +38,7 @@ class SACHyper:
     target_entropy: jax.Array | float
 
 
-@struct.dataclass
-class SACState:
+class SACState(struct.PyTreeNode):
     """Everything that learns: parameters, the target ensemble, the temperature, and Adam's moments for each."""
 
     actor: Params

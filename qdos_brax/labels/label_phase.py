@@ -17,8 +17,7 @@ from qdos_brax.population import over_members
 from qdos_brax.skills.vae import Segments, SkillModel
 
 
-@struct.dataclass
-class LabelPhaseState:
+class LabelPhaseState(struct.PyTreeNode):
     """Labels so far, every leaf [members, ...]: key, z[S, latent], the next segment to label."""
 
     key: jax.Array

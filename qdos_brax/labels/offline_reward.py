@@ -22,8 +22,8 @@ class OfflineReward(Protocol):
         """One gradient step on online rows[B], if ``active``."""
         ...
 
-    def label(self, state: Any, rows: MacroRows, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """(reward[B], mask[B]) of offline rows[B]."""
+    def label(self, state: Any, rows: MacroRows, action: jax.Array, discount: Any) -> tuple[jax.Array, jax.Array]:
+        """(reward[B], mask[B]) of offline rows[B]; ``discount`` is the one within a macro step."""
         ...
 
 
@@ -38,7 +38,7 @@ class DataReward:
         """Learns nothing."""
         return state
 
-    def label(self, state: Any, rows: MacroRows, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def label(self, state: Any, rows: MacroRows, action: jax.Array, discount: Any) -> tuple[jax.Array, jax.Array]:
         """As they are."""
         return rows.reward, rows.mask
 
@@ -64,7 +64,9 @@ class PredictedReward:
         new = self._model.update(state, rows.observation, action, rows.reward, rows.mask, learning_rate)
         return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, state)
 
-    def label(self, state: RewardModelState, rows: MacroRows, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def label(
+        self, state: RewardModelState, rows: MacroRows, action: jax.Array, discount: Any
+    ) -> tuple[jax.Array, jax.Array]:
         """Prediction, and the probability of going on."""
         reward, logit = self._model.predict(state.params, rows.observation, action)
         return reward, jax.nn.sigmoid(logit)
@@ -75,14 +77,16 @@ class MinimumReward(PredictedReward):
 
     Args:
         model: the reward model.
-        minimum: the reward of a macro step in which every environment step earned the least.
+        horizon: environment steps of a macro step; each earns -1 at worst on these tasks.
     """
 
-    def __init__(self, model: RewardModel, minimum: jax.Array | float) -> None:
+    def __init__(self, model: RewardModel, horizon: int) -> None:
         super().__init__(model)
-        self._minimum = minimum
+        self._horizon = horizon
 
-    def label(self, state: RewardModelState, rows: MacroRows, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def label(
+        self, state: RewardModelState, rows: MacroRows, action: jax.Array, discount: Any
+    ) -> tuple[jax.Array, jax.Array]:
         """The constant, and the probability of going on."""
-        _, mask = super().label(state, rows, action)
-        return jnp.full_like(rows.reward, self._minimum), mask
+        _, mask = super().label(state, rows, action, discount)
+        return jnp.full_like(rows.reward, -jnp.sum(discount ** jnp.arange(self._horizon))), mask

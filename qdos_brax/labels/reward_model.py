@@ -14,8 +14,7 @@ from qdos_brax.high_level.sac import ADAM, adam_step
 from qdos_brax.networks import MLP
 
 
-@struct.dataclass
-class RewardModelState:
+class RewardModelState(struct.PyTreeNode):
     """Parameters of both heads and Adam's moments."""
 
     params: Any

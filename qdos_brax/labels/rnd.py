@@ -14,8 +14,7 @@ from qdos_brax.high_level.sac import ADAM, adam_step
 from qdos_brax.networks import MLP
 
 
-@struct.dataclass
-class RNDState:
+class RNDState(struct.PyTreeNode):
     """The fixed random network, the predictor that learns to imitate it, and Adam's moments."""
 
     target: Any

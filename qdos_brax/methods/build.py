@@ -25,7 +25,7 @@ from qdos_brax.labels.offline_reward import DataReward, MinimumReward, OfflineRe
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.methods import METHODS, Recipe
 from qdos_brax.population import over_members
-from qdos_brax.runs.checkpoint import CheckpointStore
+from qdos_brax.runs.checkpoint import final_artifacts
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import Phase
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
@@ -92,8 +92,7 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
     if folder.read_summary() is None:
         raise UserError(f"the run in {run} has not ended; go on with: python train.py --resume {run}")
     env = envs.make(config.env, physics=config.physics)
-    phases = 4 if METHODS[config.method].weighted else 3
-    artifacts = CheckpointStore(folder.checkpoints, configs.config_hash(config)).artifacts(phases)
+    artifacts = final_artifacts(folder.checkpoints, configs.config_hash(config))
     hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
     members = configs.members(config)
     high = config.high_level
@@ -164,6 +163,4 @@ def _labeller(config: Config, recipe: Recipe, env: Any) -> OfflineReward:
     model = RewardModel(env.observation_size + config.skills.latent_dim, config.labels.reward_hidden)
     if kind == "pred":
         return PredictedReward(model)
-    # Every environment step earns at least -1 on these tasks; the lowest macro reward is H of them, discounted.
-    discount = np.float32(np.mean(config.high_level.discount))
-    return MinimumReward(model, -float(np.sum(discount ** np.arange(config.skills.horizon))))
+    return MinimumReward(model, config.skills.horizon)

@@ -45,6 +45,7 @@ class PhysicsRollout:
             start = self._env.reset_to(qpos, qvel, self._env.goal_xy)
             return jax.lax.scan(step, start, None, length=self._horizon)[1]
 
+        assert data.qpos is not None and data.qvel is not None  # refused in __init__
         return jax.vmap(one)(data.qpos[starts], data.qvel[starts], latent)
 
 

@@ -22,12 +22,12 @@ class SegmentBatch(NamedTuple):
     """Segments to judge.
 
     Attributes:
-        index: int32[B], into the list of all segments.
+        segment: int32[B], into the list of all segments.
         rows: the segments as macro transitions.
         latent: gives the posterior's mean[B, z]; a function, so that only who needs it pays for it.
     """
 
-    index: jax.Array
+    segment: jax.Array
     rows: MacroRows
     latent: Callable[[], jax.Array]
 
@@ -61,7 +61,7 @@ class UniformWeights:
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
         """Advantage 0."""
-        return jnp.zeros(batch.index.shape[0])
+        return jnp.zeros(batch.segment.shape[0])
 
 
 class LoggedWeights(UniformWeights):
@@ -69,7 +69,7 @@ class LoggedWeights(UniformWeights):
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
         """Looks them up."""
-        return artifacts["advantage"][batch.index]
+        return artifacts["advantage"][batch.segment]
 
 
 class LatentWeights:

@@ -37,8 +37,7 @@ class Rollout(NamedTuple):
     weight: jax.Array
 
 
-@struct.dataclass
-class SkillPhaseState:
+class SkillPhaseState(struct.PyTreeNode):
     """What the phase carries, every leaf [members, ...]."""
 
     key: jax.Array

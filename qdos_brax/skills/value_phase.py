@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,7 +12,7 @@ import numpy as np
 from flax import struct
 
 from qdos_brax.config import Config, SkillsConfig, ValuesConfig
-from qdos_brax.data.device import DeviceData, macro_rows
+from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import macro_return, window
 from qdos_brax.population import over_members
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState
@@ -19,8 +21,7 @@ from qdos_brax.skills.weights import segment_advantage, transition_advantage
 LABEL_BATCH = 2048
 
 
-@struct.dataclass
-class ValuePhaseState:
+class ValuePhaseState(struct.PyTreeNode):
     """What the phase carries, every leaf [members, ...]."""
 
     key: jax.Array
@@ -87,26 +88,32 @@ class ValuePhase:
 
     def _all_advantages(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> jax.Array:
         estimate = self.segment if self._skills.advantage == "segment" else self.transition
-        advantage = jax.lax.map(
-            lambda start: estimate(state.values, data, start[None], hyper["values.discount"])[0],
-            data.starts,
-            batch_size=LABEL_BATCH,
-        )
+        advantage = estimate(state.values, data, hyper["values.discount"])
         return advantage / (jnp.std(advantage) + 1e-6)
 
-    def segment(self, values: ValueState, data: DeviceData, starts: jax.Array, discount: jax.Array) -> jax.Array:
-        """sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of the windows at ``starts[B]``, [B]."""
+    def segment(self, values: ValueState, data: DeviceData, discount: jax.Array) -> jax.Array:
+        """sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of every window at ``data.starts``, [S]."""
         horizon = self._skills.horizon
-        rows = macro_rows(data, starts, horizon, discount)
-        value_end = self._iql.value(values.value, rows.next_observation)
-        value_start = self._iql.value(values.value, rows.observation)
-        return segment_advantage(rows.reward, rows.mask * discount**horizon, value_end, value_start)
+        reward, mask = macro_return(*window((data.rewards, data.masks), data.starts, horizon), discount)
+        value = partial(self._iql.value, values.value)
+        value_start = over_rows(value, data.observations)[data.starts]
+        value_end = over_rows(value, data.next_observations)[data.starts + horizon - 1]
+        return segment_advantage(reward, mask * discount**horizon, value_end, value_start)
 
-    def transition(self, values: ValueState, data: DeviceData, starts: jax.Array, discount: jax.Array) -> jax.Array:
-        """mean_t [min Q(s_t, a_t) - V(s_t)] of the windows at ``starts[B]``, [B]."""
-        observations, actions = window((data.observations, data.actions), starts, self._skills.horizon)
-        q = self._iql.q(values.critic, observations, actions).min(axis=0)
-        return transition_advantage(q, self._iql.value(values.value, observations))
+    def transition(self, values: ValueState, data: DeviceData, discount: jax.Array) -> jax.Array:
+        """mean_t [min Q(s_t, a_t) - V(s_t)] of every window at ``data.starts``, [S]."""
+
+        def gap(observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+            q = self._iql.q(values.critic, observation, action).min(axis=0)
+            return q, self._iql.value(values.value, observation)
+
+        q, value = over_rows(gap, data.observations, data.actions)
+        return transition_advantage(*window((q, value), data.starts, self._skills.horizon))
+
+
+def over_rows(function: Callable[..., Any], *arrays: jax.Array) -> Any:
+    """``function`` of single rows, over all N rows in batches that fit the cache."""
+    return jax.lax.map(lambda row: function(*row), arrays, batch_size=min(LABEL_BATCH, arrays[0].shape[0]))
 
 
 def sample_batch(data: DeviceData, key: jax.Array, size: int, n_step: int, discount: jax.Array) -> ValueBatch:

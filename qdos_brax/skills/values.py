@@ -28,8 +28,7 @@ class ValueBatch(NamedTuple):
     next_observation: jax.Array
 
 
-@struct.dataclass
-class ValueHyper:
+class ValueHyper(struct.PyTreeNode):
     """Numbers a scan may vary."""
 
     learning_rate: jax.Array | float
@@ -37,8 +36,7 @@ class ValueHyper:
     target_rate: jax.Array | float
 
 
-@struct.dataclass
-class ValueState:
+class ValueState(struct.PyTreeNode):
     """Parameters of V, of the two heads of Q and of their target, and Adam's moments."""
 
     value: Params

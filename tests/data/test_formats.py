@@ -73,9 +73,7 @@ def test_npz_equals_ogbench_reader_and_relabelling(tmp_path: Path, env: envs.Tas
     assert dataset.observations.dtype == np.float32 and dataset.observations.flags.c_contiguous
 
 
-def test_npz_cut_inside_a_trajectory_loses_only_the_row_without_a_next_state(
-    tmp_path: Path, env: envs.TaskEnv
-) -> None:
+def test_npz_cut_inside_a_trajectory_loses_only_the_row_without_a_next_state(tmp_path: Path, env: envs.TaskEnv) -> None:
     path = tmp_path / "cut.npz"
     rows = ogbench_rows(env)
     np.savez(path, **{key: value[:-2] for key, value in rows.items()})

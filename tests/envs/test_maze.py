@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ogbench_reference import ogbench_env
 
 from envs.maze import Maze, get_maze
+from tests.envs.ogbench_reference import ogbench_env
 
 
 @pytest.mark.parametrize("name", ["medium", "giant"])
@@ -79,5 +79,5 @@ def test_distance_never_passes_between_touching_walls() -> None:
 
 
 def test_unknown_maze_is_named() -> None:
-    with pytest.raises(ValueError, match="huge.*arena, medium"):
+    with pytest.raises(ValueError, match=r"huge.*arena, medium"):
         get_maze("huge")

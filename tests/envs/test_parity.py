@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from ogbench_reference import our_rollout, ogbench_env, ogbench_rollout, start_state
 
 import envs
+from tests.envs.ogbench_reference import ogbench_env, ogbench_rollout, our_rollout, start_state
 
 STEPS = 200
 
@@ -71,9 +71,9 @@ def test_model_and_task_equal_ogbench(name: str) -> None:
     env = envs.make(name, physics="mujoco")
     reference = ogbench_env(name)
     ours, theirs = env.engine.model, reference.unwrapped.model
-    names = ("geom_type geom_size geom_pos geom_quat geom_friction geom_margin geom_solref geom_solimp geom_condim "
-             "geom_contype geom_conaffinity geom_priority body_mass body_inertia body_pos jnt_type jnt_axis jnt_range "
-             "dof_armature dof_damping actuator_gear actuator_ctrlrange actuator_trnid qpos0").split()
+    names = """geom_type geom_size geom_pos geom_quat geom_friction geom_margin geom_solref geom_solimp geom_condim
+        geom_contype geom_conaffinity geom_priority body_mass body_inertia body_pos jnt_type jnt_axis jnt_range
+        dof_armature dof_damping actuator_gear actuator_ctrlrange actuator_trnid qpos0""".split()  # noqa: SIM905
     reference.reset()
     theirs.geom("target").pos[:] = ours.geom("target").pos  # OGBench moves it, for show
     for field in names:

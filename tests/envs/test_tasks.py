@@ -36,8 +36,12 @@ def test_names() -> None:
     assert envs.get_spec("antsoccer").full_name == "antsoccer-arena-task4"
     assert envs.get_spec("antsoccer-task2").full_name == "antsoccer-arena-task2"
     assert len(envs.list_tasks()) == 25
-    for wrong, near in [("antmaze-larg", "'antmaze-large'"), ("antmaze-medium-task7", "'antmaze-medium-task"),
-                        ("antsocer", "'antsoccer'"), ("", "'ant")]:
+    for wrong, near in [
+        ("antmaze-larg", "'antmaze-large'"),
+        ("antmaze-medium-task7", "'antmaze-medium-task"),
+        ("antsocer", "'antsoccer'"),
+        ("", "'ant"),
+    ]:
         with pytest.raises(ValueError, match=f"did you mean {near}"):
             envs.make(wrong)
     with pytest.raises(ValueError, match="auto, mjx or mujoco"):

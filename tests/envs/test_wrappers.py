@@ -10,9 +10,9 @@ import numpy as np
 from brax.envs.base import State
 
 import envs
+from envs.maze import get_maze
 from envs.physics import PipelineState
 from envs.task import TaskEnv, TaskSpec
-from envs.maze import get_maze
 
 
 class Slider:

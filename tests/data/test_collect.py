@@ -1,0 +1,153 @@
+"""Collection on real physics with a stand-in walker: sizes, codes, true next states, one seed repeats, two differ."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from qdos_brax.data import cache, collect, formats
+from qdos_brax.data.commands import add_parser
+from qdos_brax.data.quality import QUALITY
+from qdos_brax.errors import UserError
+
+ROWS = 650  # three episodes of 200 steps and one that is cut
+
+
+class StandIn:
+    """Acts on everything a walker sees, without knowing how to walk."""
+
+    params = np.ones(3, np.float32)
+
+    def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+        return jnp.sin(jnp.concatenate([3 * direction, qvel[:3], qpos[2:3], qpos[7:9]]))
+
+
+@pytest.fixture(scope="module", params=["antmaze-medium", "antsoccer-arena"])
+def env(request: Any) -> envs.TaskEnv:
+    return envs.make(request.param, physics="mujoco")
+
+
+@pytest.fixture(scope="module")
+def rows(env: envs.TaskEnv) -> dict[str, np.ndarray]:
+    seen: list[tuple[int, int]] = []
+    rows = collect.collect(
+        env, ROWS, 0.5, 0.2, seed=0, num_envs=2, progress=lambda *at: seen.append(at), policy=StandIn()
+    )
+    assert seen[-1] == (ROWS, ROWS) and seen == sorted(seen)
+    return rows
+
+
+def test_rows_fit_the_task(env: envs.TaskEnv, rows: dict[str, np.ndarray]) -> None:
+    assert {len(value) for value in rows.values()} == {ROWS}
+    assert rows["observations"].shape[1] == env.observation_size
+    assert np.abs(rows["actions"]).max() <= 1.0
+    assert np.flatnonzero(rows["timeouts"]).tolist() == [299, 599, 649]
+    assert not rows["terminals"].any()
+    success = env.success(rows["infos/qpos"], env.goal_xy)
+    np.testing.assert_array_equal(rows["rewards"], success - 1.0)
+    for first in (0, 300, 600):
+        assert len(np.unique(rows["infos/quality"][first : first + 50])) == 1  # one kind per episode
+
+
+def test_next_observations_are_what_the_engine_makes_of_the_row(env: envs.TaskEnv, rows: dict[str, np.ndarray]) -> None:
+    inside = ~rows["timeouts"]
+    inside[-1] = False
+    shifted = np.roll(rows["observations"], -1, axis=0)
+    np.testing.assert_array_equal(rows["next_observations"][inside], shifted[inside])
+    np.testing.assert_array_equal(rows["observations"][:, : env.engine.nq], rows["infos/qpos"])
+    for end in np.flatnonzero(rows["timeouts"]):
+        state = env.engine.init(rows["infos/qpos"][end], rows["infos/qvel"][end])
+        after = env.engine.step(state, rows["actions"][end])
+        # Only the solver's warm start and the float32 rounding of the start tell the two apart.
+        np.testing.assert_allclose(rows["next_observations"][end, : env.engine.nq], after.qpos, atol=2e-2)
+
+
+def test_one_seed_repeats_and_two_differ(env: envs.TaskEnv, rows: dict[str, np.ndarray]) -> None:
+    if env.spec.family != "antsoccer":
+        pytest.skip("soccer does all that a maze does")
+    again = collect.collect(env, ROWS, 0.5, 0.2, seed=0, num_envs=2, policy=StandIn())
+    for key, value in rows.items():
+        np.testing.assert_array_equal(again[key], value, err_msg=key)
+    other = collect.collect(env, ROWS, 0.5, 0.2, seed=1, num_envs=2, policy=StandIn())
+    assert not np.array_equal(other["actions"], rows["actions"])
+    assert not np.array_equal(other["infos/qpos"][0], rows["infos/qpos"][0])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_the_share_of_degraded_episodes_is_as_stated(share: float) -> None:
+    kinds = collect._episode_kinds(100, share, seed=0)
+    assert (kinds != QUALITY["navigate"]).sum() == round(100 * share)
+    counts = [int((kinds == code).sum()) for code in QUALITY.values() if code != QUALITY["navigate"]]
+    assert max(counts) - min(counts) <= 1
+
+
+@pytest.mark.parametrize(
+    ("transitions", "num_envs", "length"),
+    [(200, 64, 200), (4_000, 16, 250), (64_000, 64, 1000), (1_000_000, 64, 1000)],
+)
+def test_small_sets_have_shorter_episodes(transitions: int, num_envs: int, length: int) -> None:
+    assert collect._episode_length(transitions, num_envs, 1000) == length
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"transitions": 10}, {"degraded_share": 1.5}, {"noise": -1.0}, {"num_envs": 0}, {"seed": -1}],
+)
+def test_arguments_out_of_range_are_refused(env: envs.TaskEnv, wrong: dict[str, Any]) -> None:
+    right = {"transitions": 200, "degraded_share": 0.5, "noise": 0.2, "seed": 0, "num_envs": 2, "policy": StandIn()}
+    with pytest.raises(UserError):
+        collect.collect(env, **(right | wrong))
+
+
+def test_the_default_set_is_collected_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    env = envs.make("antmaze-medium", physics="mujoco")
+    monkeypatch.setenv("QDOS_DATA", str(tmp_path / "data"))
+    monkeypatch.setattr(cache.walker, "load", StandIn)
+    parameters: dict[str, Any] = {"transitions": 400, "degraded_share": 0.5, "noise": 0.2, "num_envs": 2}
+    path = cache.default_dataset(env, seed=0, **parameters)
+    assert path.parent == tmp_path / "data" and str(path) in capsys.readouterr().out
+    made = path.stat().st_mtime_ns
+    assert cache.default_dataset(env, seed=0, **parameters) == path and path.stat().st_mtime_ns == made
+    assert cache.default_dataset(env, seed=1, **parameters) != path
+    dataset = formats.read(path, env)
+    assert dataset.size == 400 and dataset.quality is not None
+    assert "wander=" in formats.read_attrs(path)["composition"]
+
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("QDOS_DATA", str(tmp_path / "file"))
+    with pytest.raises(UserError, match="QDOS_DATA"):
+        cache.default_dataset(env, seed=0, **parameters)
+
+
+def test_commands_make_info_and_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    add_parser(parser.add_subparsers(required=True))
+
+    def run(*words: str) -> tuple[int, str]:
+        args = parser.parse_args(["data", *words])
+        return args.run(args), capsys.readouterr().out
+
+    monkeypatch.setattr(collect.walker, "load", StandIn)
+    path = str(tmp_path / "set.hdf5")
+    assert run("make", "antmaze-medium", "--out", path, "--transitions", "400", "--num-envs", "2") == (0, f"{path}\n")
+    code, text = run("info", path)
+    assert code == 0 and "400" in text and "navigate 50.0%" in text
+    assert run("check", path, "--env", "antmaze-medium")[0] == 0
+    code, text = run("check", path, "--env", "antsoccer-arena")
+    assert code == 2 and "observations has 29 numbers per row, antsoccer-arena has 42" in text
+    code, text = run("check", path, "--env", "antmaze-medium", "--horizon", "500")
+    assert code == 2 and "no episode has 500 steps" in text
+    with pytest.raises(UserError, match="did you mean"):
+        run("check", path, "--env", "antmaze-medum")
+    with pytest.raises(UserError, match=r"\.hdf5"):
+        run("make", "antmaze-medium", "--out", str(tmp_path / "set.npz"))

@@ -1,0 +1,107 @@
+"""The macro step on an environment whose every number is known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.base import Env, State
+
+from qdos_brax.high_level.evaluation import evaluate
+from qdos_brax.high_level.latent_map import ArctanhMap, BoxMap
+from qdos_brax.high_level.macro_step import macro_step, reset_done
+
+
+class Line(Env):
+    """x grows by the action; success (read before the action) at x >= goal; a cap on steps. obs = [x]."""
+
+    def __init__(self, goal=3.0, cap=100):
+        self.goal, self.cap = goal, cap
+
+    def reset(self, rng):
+        zero, obs = jnp.zeros(()), jnp.zeros(1)
+        info = {"truncation": zero, "final_obs": obs, "steps": jnp.zeros((), jnp.int32), "reset_key": rng}
+        return State(zero, obs, zero, zero, {"success": zero}, info)
+
+    def step(self, state, action):
+        success = (state.pipeline_state >= self.goal).astype(jnp.float32)
+        x = state.pipeline_state + action[0]
+        steps = state.info["steps"] + 1
+        capped = (steps >= self.cap).astype(jnp.float32)
+        info = state.info | {"steps": steps, "truncation": capped * (1 - success), "final_obs": x[None]}
+        return state.replace(
+            pipeline_state=x, obs=x[None], reward=success - 1, done=jnp.maximum(success, capped),
+            metrics={"success": success}, info=info,
+        )  # fmt: skip
+
+    observation_size = 1
+    action_size = 1
+    backend = "toy"
+
+
+def play(env, horizon, discount, action=1.0, state=None):
+    state = env.reset(jax.random.key(0)) if state is None else state
+    return macro_step(env, lambda obs: jnp.full(1, action), state, horizon, discount)
+
+
+def test_reward_is_discounted_and_the_mask_stays_without_an_end():
+    _, result = play(Line(goal=100.0), horizon=4, discount=0.5)
+    assert float(result.reward) == -1 - 0.5 - 0.25 - 0.125
+    assert (float(result.mask), int(result.steps), float(result.success)) == (1.0, 4, 0.0)
+    assert float(result.next_observation[0]) == 4.0 and float(result.episode_return) == -4.0
+
+
+def test_success_ends_it_early_and_what_follows_idles():
+    # x = 0, 1, 2, 3: the fourth step reads success, earns 0 and ends; the other two are not lived.
+    state, result = play(Line(goal=3.0), horizon=6, discount=0.5)
+    assert float(result.reward) == -1 - 0.5 - 0.25
+    assert (float(result.mask), int(result.steps), float(result.success)) == (0.0, 4, 1.0)
+    assert float(result.next_observation[0]) == 4.0 and float(state.pipeline_state) == 4.0
+
+
+def test_the_cap_ends_it_early_but_bootstraps():
+    _, result = play(Line(goal=100.0, cap=3), horizon=6, discount=1.0)
+    assert (float(result.reward), float(result.mask), int(result.steps)) == (-3.0, 1.0, 3)
+    assert float(result.next_observation[0]) == 3.0 and float(result.success) == 0.0
+
+
+def test_a_finished_episode_gives_no_live_steps():
+    state, _ = play(Line(goal=3.0), horizon=6, discount=1.0)
+    _, result = play(Line(goal=3.0), horizon=6, discount=1.0, state=state)
+    assert int(result.steps) == 0 and float(result.reward) == 0.0
+
+
+def test_a_broken_simulation_is_told():
+    _, result = play(Line(), horizon=2, discount=1.0, action=jnp.nan)
+    assert not bool(result.finite)
+    _, result = play(Line(), horizon=2, discount=1.0)
+    assert bool(result.finite)
+
+
+def test_reset_only_where_the_episode_is_over():
+    env = Line(goal=3.0)
+    over, _ = play(env, horizon=6, discount=1.0)
+    going, _ = play(env, horizon=2, discount=1.0)
+    assert float(reset_done(env, over, jnp.array(False), jax.random.key(1)).pipeline_state) == 0.0
+    assert float(reset_done(env, going, jnp.array(False), jax.random.key(1)).pipeline_state) == 2.0
+    assert float(reset_done(env, going, jnp.array(True), jax.random.key(1)).pipeline_state) == 0.0
+
+
+@pytest.mark.parametrize(("goal", "success", "total", "length"), [(7.0, 1.0, -7.0, 8), (1000.0, 0.0, -20.0, 20)])
+def test_evaluation_plays_whole_episodes(goal, success, total, length):
+    env = Line(goal=goal, cap=20)
+    episodes = evaluate(env, lambda obs: jnp.ones(1), lambda obs, z: z, jax.random.key(0), episodes=3, horizon=6)
+    np.testing.assert_array_equal(episodes.success, [success] * 3)
+    np.testing.assert_array_equal(episodes.episode_return, [total] * 3)
+    np.testing.assert_array_equal(episodes.length, [length] * 3)
+
+
+@pytest.mark.parametrize("mapping", [ArctanhMap(), BoxMap(2.0)])
+def test_latent_maps_are_inverses_and_labels_stay_inside(mapping):
+    u = jnp.array([-0.9, 0.0, 0.5])
+    np.testing.assert_allclose(mapping.to_action(mapping.to_latent(u)), u, atol=1e-6)
+    assert float(jnp.max(jnp.abs(mapping.to_action(jnp.array([50.0, -50.0]))))) < 1.0
+
+
+def test_latent_maps_by_hand():
+    np.testing.assert_allclose(ArctanhMap().to_latent(jnp.array([0.5])), 0.5493061, rtol=1e-5)
+    np.testing.assert_allclose(BoxMap(2.0).to_latent(jnp.array([0.5])), 1.0)

@@ -1,0 +1,118 @@
+"""Values, weights and the VAE against numbers derived by hand or by an independent formula."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qdos_brax.networks import gaussian_kl, gaussian_sample
+from qdos_brax.skills.vae import Segments, SkillModel
+from qdos_brax.skills.values import IQL, ValueBatch, expectile_loss
+from qdos_brax.skills.weights import advantage_weights, latent_advantage, segment_advantage, transition_advantage
+
+
+def test_expectile_loss_by_hand():
+    np.testing.assert_allclose(expectile_loss(jnp.array([2.0, -2.0, 0.0]), 0.9), [3.6, 0.4, 0.0], rtol=1e-6)
+
+
+def test_the_minimiser_of_the_expectile_loss_is_the_expectile():
+    # For half 0, half 1 the expectile m solves tau (1 - m) = (1 - tau) m, so m = tau.
+    grid = jnp.linspace(0, 1, 1001)
+    loss = jax.vmap(lambda m: expectile_loss(jnp.array([0.0, 1.0]) - m, 0.9).mean())(grid)
+    assert float(grid[jnp.argmin(loss)]) == pytest.approx(0.9, abs=2e-3)
+
+
+def test_critic_target_is_the_n_step_return():
+    iql = IQL(2, 1, (4,))
+    state = iql.init(jax.random.key(0))
+    batch = ValueBatch(
+        jnp.ones((2, 2)), jnp.zeros((2, 1)), jnp.array([-3.0, -1.0]), jnp.array([0.9**4, 0.0]), 2 * jnp.ones((2, 2))
+    )
+    value = float(iql.value(state.value, 2 * jnp.ones(2)))
+    q = np.asarray(iql.q(state.critic, batch.observation, batch.action))
+    target = np.array([-3 + 0.9**4 * value, -1.0])
+    expected = np.mean((q[0] - target) ** 2) + np.mean((q[1] - target) ** 2)
+    np.testing.assert_allclose(iql.critic_loss(state.critic, state.value, batch), expected, rtol=1e-5)
+
+
+def test_advantages_by_hand():
+    np.testing.assert_allclose(segment_advantage(jnp.array([-2.0]), 0.5, jnp.array([-4.0]), jnp.array([-5.0])), [1.0])
+    np.testing.assert_allclose(
+        transition_advantage(jnp.array([[1.0, 2.0, 3.0]]), jnp.array([[0.0, 3.0, 3.0]])), [0.0], atol=1e-7
+    )
+    np.testing.assert_allclose(latent_advantage(jnp.array([3.0]), jnp.array([1.0])), [2.0])
+
+
+def test_weights_by_hand():
+    # exp(0), exp(log 3) have mean 2, so the weights are 1/2 and 3/2; lambda 2 takes the root of the ratio.
+    np.testing.assert_allclose(advantage_weights(jnp.array([0.0, jnp.log(3.0)]), 1.0, 20.0), [0.5, 1.5], rtol=1e-6)
+    ratio = advantage_weights(jnp.array([0.0, jnp.log(3.0)]), 2.0, 20.0)
+    np.testing.assert_allclose(ratio[1] / ratio[0], np.sqrt(3), rtol=1e-5)
+
+
+def test_weights_are_clipped_and_never_overflow():
+    weight = advantage_weights(jnp.array([1e4] + [0.0] * 99), 0.1, 20.0)
+    np.testing.assert_allclose(weight[0], 20.0)
+    assert np.all(np.isfinite(weight))
+
+
+def test_no_gradient_passes_through_the_weights():
+    grad = jax.grad(lambda a: jnp.sum(advantage_weights(a, 1.0, 20.0) * jnp.arange(3.0)))(jnp.array([0.0, 1.0, 2.0]))
+    np.testing.assert_array_equal(grad, 0.0)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return SkillModel(3, 2, 2, encoder_hidden=8, encoder_layers=1, decoder_hidden=(8,), prior_hidden=(8,))
+
+
+@pytest.fixture(scope="module")
+def segments():
+    keys = jax.random.split(jax.random.key(0), 2)
+    return Segments(jax.random.normal(keys[0], (4, 5, 3)), jnp.tanh(jax.random.normal(keys[1], (4, 5, 2))))
+
+
+@pytest.mark.parametrize("kl_weighted", [True, False])
+def test_vae_loss_is_the_papers_formula(model, segments, kl_weighted):
+    params = model.init(jax.random.key(1))
+    weight = jnp.array([0.5, 1.5, 2.0, 0.0])
+    key = jax.random.key(2)
+    loss, _ = model.vae_loss(params, segments, weight, 0.2, key, kl_weighted)
+
+    posterior = model.encode(params, segments)
+    latent = gaussian_sample(key, *posterior)
+    kl = gaussian_kl(*posterior, *model.prior(params, segments.observations[:, 0]))
+    total = 0.0
+    for i in range(4):
+        log_likelihood = 0.0
+        for t in range(5):
+            mean, log_std = model.decode(params, segments.observations[i, t], latent[i])
+            error = (segments.actions[i, t] - mean) / jnp.exp(log_std)
+            log_likelihood += float(jnp.sum(-0.5 * error**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)))
+        total += 0.2 * float(kl[i]) * (float(weight[i]) if kl_weighted else 1.0) - float(weight[i]) * log_likelihood
+    np.testing.assert_allclose(loss, total / 4, rtol=1e-4)
+
+
+def test_information_loss_is_the_weighted_squared_error_of_the_recovered_skill(model, segments):
+    params = model.init(jax.random.key(1))
+    latent = jax.random.uniform(jax.random.key(3), (4, 2), minval=-2, maxval=2)
+    weight = jnp.array([0.5, 1.5, 2.0, 0.0])
+    actions = jnp.stack(
+        [jnp.stack([model.decode(params, segments.observations[i, t], latent[i])[0] for t in range(5)])
+         for i in range(4)]
+    )  # fmt: skip
+    recovered = model.encode(params, Segments(segments.observations, actions)).mean
+    expected = np.mean(np.asarray(weight) * np.sum((np.asarray(recovered) - np.asarray(latent)) ** 2, axis=1))
+    np.testing.assert_allclose(
+        model.information_loss(params, segments.observations, latent, weight), expected, rtol=1e-5
+    )
+
+
+def test_the_gradient_of_the_information_loss_reaches_the_decoder_and_not_the_states(model, segments):
+    params = model.init(jax.random.key(1))
+    latent, weight = jnp.ones((4, 2)), jnp.ones(4)
+    grads = jax.grad(model.information_loss)(params, segments.observations, latent, weight)
+    assert max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(grads["decoder"])) > 0
+    assert max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(grads["encoder"])) > 0
+    to_states = jax.grad(model.information_loss, argnums=1)(params, segments.observations, latent, weight)
+    np.testing.assert_array_equal(to_states, 0.0)

@@ -1,0 +1,171 @@
+"""Layers, ranges, scans, and one line for every wrong key."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qdos_brax import config as configs
+from qdos_brax.config import Config, load_config
+from qdos_brax.errors import UserError
+
+
+@pytest.mark.parametrize("preset", configs.presets())
+@pytest.mark.parametrize("family", configs.families())
+def test_every_family_loads_with_every_preset(family: str, preset: str, tmp_path: Path) -> None:
+    config = load_config(f"{family}-x", preset)
+    path = tmp_path / "config.yaml"
+    path.write_text(configs.to_yaml(config))
+    assert configs.from_yaml(path) == config
+    assert hash(config) == hash(configs.from_yaml(path))
+
+
+def test_the_papers_values() -> None:
+    soccer, maze = load_config("antsoccer", "paper"), load_config("antmaze-large", "paper")
+    assert (soccer.skills.encoder_hidden, soccer.skills.encoder_layers) == (512, 3)
+    assert (maze.skills.encoder_hidden, maze.skills.encoder_layers) == (256, 2)
+    assert soccer.high_level.hidden == (512, 512, 512) and maze.high_level.hidden == (256, 256, 256)
+    assert soccer.high_level.discount == soccer.values.discount == 0.995 and maze.high_level.discount == 0.99
+    assert load_config("scene", "paper").skills.kl_weight == 0.2 and maze.skills.kl_weight == 0.1
+    for config in (soccer, maze):
+        assert (config.skills.horizon, config.skills.latent_dim, config.skills.batch_size) == (20, 8, 256)
+        assert (config.high_level.ensemble, config.high_level.utd, config.high_level.batch_size) == (10, 20, 256)
+        assert (config.values.expectile, config.labels.rnd_coefficient) == (0.9, 8.0)
+    kitchen = load_config("kitchen-mixed", "paper").high_level
+    assert (kitchen.target_subset, kitchen.init_temperature) == (2, 1.0)
+
+
+def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "presets").mkdir()
+    (tmp_path / "antmaze.yaml").write_text("skills: {alpha: 0.3, kl_weight: 0.1, horizon: 10}\nvalues: {n_step: 5}")
+    (tmp_path / "antsoccer.yaml").write_text("")
+    preset = "skills: {alpha: 0.4, kl_weight: 0.5, horizon: 8}\nfamilies: {antmaze: {skills: {kl_weight: 0.6}}}"
+    (tmp_path / "presets" / "tiny.yaml").write_text(preset)
+    monkeypatch.setattr(configs, "CONFIG_DIR", tmp_path)
+    config = load_config("antmaze", "tiny", {"skills.alpha": "0.7", "skills.horizon": 6}, ["skills.alpha=0.8"])
+    assert config.values.n_step == 5  # family over default
+    assert config.skills.kl_weight == 0.6  # the preset's section over the preset over the family
+    assert config.skills.horizon == 6  # flag over preset
+    assert config.skills.alpha == 0.8  # --set over flag
+    assert load_config("antsoccer", "tiny").skills.kl_weight == 0.5
+
+
+def test_every_key_can_be_set() -> None:
+    """What ``to_yaml`` writes can be given back key by key."""
+    config = load_config("antsoccer", "cpu")
+    plain = configs._flat(configs._plain(config))
+    sets = [f"{key}={str(value).lower()}" for key, value in plain.items() if value is not None]
+    sets = [text for text in sets if not text.startswith(("env=", "preset="))]
+    assert load_config("antsoccer", "cpu", sets=sets) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("skils.alpha=1", "unknown key 'skils.alpha', did you mean 'skills.alpha'"),
+        ("alpha=1", "did you mean 'skills.alpha'"),
+        ("values.expectil=1", "did you mean 'values.expectile'"),
+        ("skills=3", "group of keys"),
+        ("foo", "key=value"),
+        ("env=antmaze", "use --env"),
+        ("data.noise=[1", "cannot read"),
+        ("skills.alpha=nan", "finite"),
+        ("skills.alpha=.inf", "finite"),
+        ("skills.alpha=-0.1", "at least 0"),
+        ("skills.alpha=", "a number"),
+        ("skills.alpha=0.1,0.1", "same value twice"),
+        ("values.expectile=0", "above 0"),
+        ("values.expectile=1.5", "at most 1"),
+        ("skills.batch_size=0", "at least 1"),
+        ("skills.batch_size=true", "whole number"),
+        ("skills.updates=1.5", "whole number"),
+        ("high_level.utd=1,2", "cannot be scanned"),
+        ("high_level.hidden=64,0", "at least 1"),
+        ("high_level.target_subset=11", "must not exceed high_level.ensemble"),
+        ("high_level.env_steps=10", "less than one macro step"),
+        ("skills.kl_weighted=3", "true or false"),
+        ("skills.advantage=segmnt", "did you mean 'segment'"),
+        ("seed=-1", "at least 0"),
+        ("seed=", "a whole number"),
+    ],
+)
+def test_wrong_settings_are_one_line(text: str, message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        load_config("antmaze", "paper", sets=[text])
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_names_propose_the_nearest() -> None:
+    with pytest.raises(UserError, match="did you mean 'antmaze'"):
+        load_config("antmase-large", "cpu")
+    with pytest.raises(UserError, match="did you mean 'smoke'"):
+        load_config("antmaze", "smokey")
+
+
+def test_broken_files_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    for content, message in [("a: [", "not valid YAML"), ("- 1", "keys and values"), ("skills: {alfa: 1}", "alpha")]:
+        path.write_text(content)
+        with pytest.raises(UserError, match=message) as caught:
+            configs.from_yaml(path)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match="No such file"):
+        configs.from_yaml(tmp_path / "absent.yaml")
+
+
+def test_numbers_as_people_write_them() -> None:
+    sets = ["skills.updates=1e5", "values.updates=20_000", "values.learning_rate=1e-4", "high_level.hidden=[64, 32]"]
+    config = load_config("antmaze", "paper", sets=sets)
+    assert config.skills.updates == 100_000 and isinstance(config.skills.updates, int)
+    assert config.values.updates == 20_000
+    assert config.values.learning_rate == 1e-4
+    assert config.high_level.hidden == (64, 32)
+    assert load_config("antmaze", "paper", sets=["high_level.hidden=64"]).high_level.hidden == (64,)
+
+
+def test_members_are_the_product() -> None:
+    flags = {"skills.alpha": "0.1,0.2", "seed": "0,1,2"}
+    config = load_config("antsoccer", "cpu", flags, ["labels.rnd_coefficient=2,8"])
+    members = configs.members(config)
+    assert len(members) == 12
+    assert members[0] == {"seed": 0, "alpha": 0.1, "labels.rnd_coefficient": 2.0}
+    assert len({tuple(member.items()) for member in members}) == 12
+    hyper = configs.population_hyper(config)
+    assert hyper["skills.alpha"].dtype == np.float32 and hyper["skills.alpha"].shape == (12,)
+    for index, member in enumerate(members):
+        tree = configs.hyper_tree(config, member)
+        assert tree["skills.alpha"] == member["alpha"]
+        assert hyper["labels.rnd_coefficient"][index] == tree["labels.rnd_coefficient"]
+    with pytest.raises(UserError, match="2 values where one is wanted"):
+        configs.hyper_tree(config)
+
+
+def test_hyper_holds_what_can_be_scanned_and_no_more() -> None:
+    tree = configs.hyper_tree(Config())
+    assert {"skills.alpha", "skills.advantage_temperature", "values.expectile", "high_level.discount"} <= set(tree)
+    assert not {"skills.horizon", "high_level.offline_fraction", "data.noise", "high_level.utd"} & set(tree)
+    assert configs.members(Config()) == [{"seed": 0, "alpha": 0.2}]
+
+
+def test_hash_tells_results_apart_and_nothing_else() -> None:
+    config = load_config("antmaze", "paper")
+    same = configs.replace(config, out="elsewhere", dataset="file.npz", **{"run.checkpoint_seconds": 1})
+    assert configs.config_hash(same) == configs.config_hash(config)
+    assert configs.config_hash(configs.replace(config, **{"skills.alpha": 0.25})) != configs.config_hash(config)
+
+
+def test_frozen() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Config().env = "antsoccer"  # type: ignore[misc]
+
+
+def test_every_field_is_documented() -> None:
+    for group in (
+        Config,
+        *(type(f.default) for f in dataclasses.fields(Config) if dataclasses.is_dataclass(f.default)),
+    ):
+        for field in dataclasses.fields(group):
+            assert f"        {field.name}: " in (group.__doc__ or ""), f"{group.__name__}.{field.name}"
