@@ -1,0 +1,193 @@
+"""Phase 2 on the plane: it finds the goal, learns from what it should, and repeats."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qdos_brax import config as configs
+from qdos_brax.data.device import MacroRows, to_device
+from qdos_brax.high_level.online_phase import OnlinePhase
+from qdos_brax.labels.label_phase import LabelPhase
+from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
+from qdos_brax.labels.reward_model import RewardModel
+from qdos_brax.labels.rnd import RND
+from qdos_brax.skills.segment_weights import UniformWeights
+from qdos_brax.skills.skill_phase import SkillPhase
+from qdos_brax.skills.vae import SkillModel
+from tests.point import PointEnv, point_config, point_dataset
+
+
+def build(config, labeller=None):
+    """(phase, artifacts, keys) with trained skills and labels of the plane."""
+    env, dataset = PointEnv(), point_dataset()
+    data, normaliser = to_device(dataset, config.skills.horizon)
+    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    model = SkillModel(4, 2, config.skills.latent_dim, 16, 1, (32, 32), (32, 32))
+    keys = jax.vmap(jax.random.key)(np.array([member["seed"] for member in configs.members(config)], np.uint32))
+    skills = SkillPhase(config, data, hyper, model, UniformWeights(), None)
+    artifacts = run(skills, keys, {})
+    artifacts = run(LabelPhase(config, data, len(keys), model), keys, artifacts)
+    phase = OnlinePhase(config, env, data, normaliser, hyper, model, labeller or DataReward(), steps_per_chunk=100)
+    return phase, artifacts, keys
+
+
+def run(phase, keys, artifacts):
+    state = phase.init(keys, artifacts)
+    for _ in range(phase.num_chunks):
+        state, _ = phase.chunk(state)
+    return phase.finish(state, artifacts)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    config = point_config(
+        **{
+            "skills.updates": 600,
+            "skills.learning_rate": 3e-3,
+            "skills.kl_weight": 0.01,
+            "high_level.env_steps": 6000,
+            "high_level.utd": 8,
+            "high_level.learning_rate": 1e-3,
+            "high_level.target_rate": 0.02,
+            "high_level.warmup_env_steps": 500,
+            "labels.rnd_coefficient": 0.1,
+            "eval.episodes": 20,
+            "eval.every_env_steps": 2000,
+        }
+    )
+    phase, artifacts, keys = build(config)
+    state = phase.init(keys, artifacts)
+    history = []
+    for _ in range(phase.num_chunks):
+        state, metrics = phase.chunk(state)
+        history.append(metrics)
+    return phase, state, history
+
+
+def test_the_high_level_learns_to_reach_the_goal(trained):
+    _, _, history = trained
+    evaluations = [float(m["eval/success"][0]) for m in history if "eval/success" in m]
+    assert len(evaluations) >= 3
+    assert evaluations[-1] >= 0.9, evaluations
+
+
+def test_first_goal_and_counts_are_kept(trained):
+    phase, state, history = trained
+    first = float(history[-1]["first_goal_step"][0])
+    assert 0 < first <= float(history[-1]["env_steps"][0])
+    assert int(state.replay.size[0]) <= phase._config.high_level.replay_capacity
+    assert bool(state.healthy[0]) and int(state.broken[0]) == 0
+
+
+def test_a_phase_is_traced_once(trained):
+    phase, _, _ = trained
+    assert phase._chunk._cache_size() == 1
+
+
+def test_the_batch_is_half_offline_and_half_online():
+    phase, artifacts, keys = build(point_config())
+    state, _ = phase.chunk(phase.init(keys, artifacts))
+    member = jax.tree.map(lambda x: x[0], state)
+    frozen = {"skills": None, "labels": artifacts["labels"][0]}
+    hyper = {key: value[0] for key, value in phase._hyper.items()}
+    batch = phase._sample(member.learners, member.replay, jax.random.key(0), frozen=frozen, hyper=hyper,
+                          data=phase._data)  # fmt: skip
+    online = np.asarray(member.replay.data.observation[: int(member.replay.size)])
+    offline = np.asarray(phase._data.observations)
+    half = len(batch.observation) // 2
+    first, second = np.asarray(batch.observation[:half]), np.asarray(batch.observation[half:])
+    assert all((row == offline).all(axis=1).any() for row in first)
+    assert all((row == online).all(axis=1).any() for row in second)
+
+
+def test_seeds_differ_and_repeat():
+    config = configs.replace(point_config(), seed=(0, 1))
+    results = []
+    for _ in range(2):
+        phase, artifacts, keys = build(config)
+        state, _ = phase.chunk(phase.init(keys, artifacts))
+        results.append([np.asarray(leaf) for leaf in jax.tree.leaves(state.learners.sac.actor)])
+    for a, b in zip(*results, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert any(not np.array_equal(a[0], a[1]) for a in results[0])
+
+
+def test_a_member_that_diverges_is_frozen_and_the_other_goes_on():
+    config = configs.replace(point_config(), **{"high_level.learning_rate": (1e-3, 1e-2)})
+    phase, artifacts, keys = build(config)
+    state = phase.init(keys, artifacts)
+    broken = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.learners.sac.critic)
+    learners = state.learners.replace(sac=state.learners.sac.replace(critic=broken))
+    after, metrics = phase.chunk(state.replace(learners=learners))
+    np.testing.assert_array_equal(metrics["status_ok"], [True, False])
+    assert all(np.isfinite(leaf[0]).all() for leaf in jax.tree.leaves(after.learners.sac.critic))
+
+
+def test_labels_are_samples_of_the_posterior():
+    config = point_config()
+    data, _ = to_device(point_dataset(), config.skills.horizon)
+    model = SkillModel(4, 2, 2, 16, 1, (32, 32), (32, 32))
+    params = model.init(jax.random.key(0))
+    encoder = jax.tree.map(jnp.zeros_like, params["encoder"])
+    encoder["params"]["Dense_0"]["bias"] = jnp.array([1.0, -2.0, -5.0, -5.0])  # mean (1, -2), deviation exp(-5)
+    artifacts = {"skills": jax.tree.map(lambda x: x[None], params | {"encoder": encoder})}
+    phase = LabelPhase(config, data, 1, model, chunk_size=1000)
+    assert phase.num_chunks > 1
+    labels = run(phase, jax.vmap(jax.random.key)(np.zeros(1, np.uint32)), artifacts)["labels"]
+    assert labels.shape == (1, data.starts.shape[0], 2)
+    np.testing.assert_allclose(labels[0], np.broadcast_to([1.0, -2.0], labels.shape[1:]), atol=0.05)
+
+
+def rows(size=64):
+    keys = jax.random.split(jax.random.key(0), 2)
+    observation = jax.random.normal(keys[0], (size, 2))
+    mask = (observation[:, 0] < 1).astype(jnp.float32)
+    return MacroRows(observation, -2 * mask, mask, observation), jax.random.normal(keys[1], (size, 1))
+
+
+def test_offline_rewards_by_hand():
+    batch, action = rows()
+    reward, mask = DataReward().label({}, batch, action, 0.9)
+    np.testing.assert_array_equal(reward, batch.reward)
+    np.testing.assert_array_equal(mask, batch.mask)
+    minimum = MinimumReward(RewardModel(3, (8,)), horizon=3)
+    reward, _ = minimum.label(minimum.init(jax.random.key(0)), batch, action, 0.5)
+    np.testing.assert_allclose(reward, -1.75)
+
+
+def test_the_reward_model_learns_rewards_and_ends_and_waits_for_its_start():
+    batch, action = rows()
+    labeller = PredictedReward(RewardModel(3, (32,)))
+    state = labeller.init(jax.random.key(1))
+    waiting = labeller.learn(state, batch, action, 1e-2, jnp.array(False))
+    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(waiting), strict=True):
+        np.testing.assert_array_equal(a, b)
+    learn = jax.jit(lambda s: labeller.learn(s, batch, action, 1e-2, jnp.array(True)))
+    for _ in range(300):
+        state = learn(state)
+    reward, mask = labeller.label(state, batch, action, 0.9)
+    assert float(jnp.mean((reward - batch.reward) ** 2)) < 0.05
+    assert float(jnp.mean(jnp.abs(mask - batch.mask))) < 0.1
+
+
+def test_reward_model_loss_by_hand():
+    model = RewardModel(2, (4,))
+    params = jax.tree.map(jnp.zeros_like, model.init(jax.random.key(0)).params)
+    # Everything 0: reward error 4 and 0, and -log(1/2) for either mask.
+    loss = model.loss(params, jnp.ones((2, 1)), jnp.ones((2, 1)), jnp.array([2.0, 0.0]), jnp.array([1.0, 0.0]))
+    np.testing.assert_allclose(loss, 2 + np.log(2), rtol=1e-6)
+
+
+def test_rnd_error_falls_where_it_was_trained_and_stays_elsewhere():
+    rnd = RND(3, (32, 32), 16)
+    state = rnd.init(jax.random.key(0))
+    seen, new = jnp.zeros((64, 2)) + 0.1 * jax.random.normal(jax.random.key(1), (64, 2)), 3 * jnp.ones((64, 2))
+    action = jnp.zeros((64, 1))
+    before = rnd.error(state.predictor, state.target, new, action).mean()
+    update = jax.jit(lambda s: rnd.update(s, seen, action, 1e-3))
+    for _ in range(300):
+        state = update(state)
+    known = rnd.error(state.predictor, state.target, seen, action).mean()
+    unknown = rnd.error(state.predictor, state.target, new, action).mean()
+    assert float(known) < 0.05 * float(unknown) and float(unknown) > 0.2 * float(before)
