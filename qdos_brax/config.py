@@ -214,7 +214,8 @@ class HighLevelConfig:
         target_rate: Polyak rate of the target critics.
         init_temperature: first value of the entropy temperature.
         target_entropy_scale: the target entropy is minus this times the latent dimension.
-        latent_map: from the action u in (-1, 1) to the skill z: "arctanh", or "box" (z = latent_box * u).
+        latent_map: from the action u in (-1, 1) to the skill z: "arctanh", "box" (z = latent_box * u), or "prior"
+            (z = mean + latent_box * standard deviation * u of the state prior).
         num_envs: environments stepped side by side.
         warmup_env_steps: first environment steps, acted by the state prior instead of the actor.
         env_steps: environment steps of the online phase, over all environments.
@@ -232,7 +233,7 @@ class HighLevelConfig:
     target_rate: Scannable = _number(0.005, high=1.0, above=True)
     init_temperature: Scannable = _number(0.05, above=True)
     target_entropy_scale: Scannable = _number(0.5)
-    latent_map: str = _choice("arctanh", "arctanh", "box")
+    latent_map: str = _choice("arctanh", "arctanh", "box", "prior")
     num_envs: int = _count(1)
     warmup_env_steps: int = _count(5_000, low=0)
     env_steps: int = _count(200_000)

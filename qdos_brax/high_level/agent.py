@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from qdos_brax.data.device import Normaliser
-from qdos_brax.high_level.latent_map import LatentMap
+from qdos_brax.high_level.latent_map import LatentMap, Prior
 from qdos_brax.high_level.sac import SAC
 from qdos_brax.skills.vae import SkillModel
 
@@ -35,7 +35,12 @@ class Agent:
 
     def choose(self, observation: jax.Array) -> jax.Array:
         """The skill z[..., latent] for observation[..., obs]: the mode of the high level's policy."""
-        return self.latent_map.to_latent(self.sac.mode(self.actor, self.normaliser(observation)))
+        normal = self.normaliser(observation)
+        return self.latent_map.to_latent(self.sac.mode(self.actor, normal), self.prior(normal))
+
+    def prior(self, normal: jax.Array) -> Prior:
+        """p(z | s) at normalised observations[..., obs]."""
+        return Prior(*self.model.prior(self.skills, normal))
 
     def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
         """The action[..., act] of skill z at an observation."""

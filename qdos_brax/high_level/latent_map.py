@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +10,21 @@ import jax.numpy as jnp
 MARGIN = 1e-5  # labels stay this far inside the box, where arctanh and the actor's density are finite (SUPE)
 
 
-class LatentMap(Protocol):
-    """A bijection of (-1, 1)^d onto the latents that the high level can play."""
+class Prior(NamedTuple):
+    """p(z | s) where the skill starts: mean[..., d] and log standard deviation[..., d]."""
 
-    def to_latent(self, action: jax.Array) -> jax.Array:
+    mean: jax.Array
+    log_std: jax.Array
+
+
+class LatentMap(Protocol):
+    """A bijection of (-1, 1)^d onto the latents that the high level can play in a state."""
+
+    def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
         """z[..., d] of u[..., d]."""
         ...
 
-    def to_action(self, latent: jax.Array) -> jax.Array:
+    def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
         """u[..., d] of z[..., d], clipped into the box."""
         ...
 
@@ -25,13 +32,13 @@ class LatentMap(Protocol):
 class ArctanhMap:
     """z = arctanh(u): every latent can be played (SUPE)."""
 
-    def to_latent(self, action: jax.Array) -> jax.Array:
+    def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
         """z = arctanh(u)."""
         return jnp.arctanh(jnp.clip(action, -1 + MARGIN, 1 - MARGIN))
 
-    def to_action(self, latent: jax.Array) -> jax.Array:
+    def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
         """u = tanh(z)."""
-        return jnp.clip(jnp.tanh(latent), -1 + MARGIN, 1 - MARGIN)
+        return _inside(jnp.tanh(latent))
 
 
 class BoxMap:
@@ -44,15 +51,44 @@ class BoxMap:
     def __init__(self, half_side: jax.Array | float) -> None:
         self._half_side = half_side
 
-    def to_latent(self, action: jax.Array) -> jax.Array:
+    def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
         """z = c u."""
         return self._half_side * action
 
-    def to_action(self, latent: jax.Array) -> jax.Array:
+    def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
         """u = z / c."""
-        return jnp.clip(latent / self._half_side, -1 + MARGIN, 1 - MARGIN)
+        return _inside(latent / self._half_side)
+
+
+class PriorMap:
+    """z = mean(s) + c std(s) u: the skills that the prior holds for likely in this state.
+
+    The learned prior leaves the scale of z free, so that a fixed map may reach far outside the skills that exist; what
+    the decoder does there is arbitrary, and an actor that saturates gets stuck. This map cannot leave them. (SPiRL,
+    Pertsch et al. 2020, holds the high level near the prior by a penalty instead.)
+
+    Args:
+        half_side: c, in standard deviations of the prior.
+    """
+
+    def __init__(self, half_side: jax.Array | float) -> None:
+        self._half_side = half_side
+
+    def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
+        """z = mean + c std u."""
+        return prior.mean + self._half_side * jnp.exp(prior.log_std) * action
+
+    def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
+        """u = (z - mean) / (c std)."""
+        return _inside((latent - prior.mean) * jnp.exp(-prior.log_std) / self._half_side)
 
 
 def latent_map(name: str, half_side: jax.Array | float) -> LatentMap:
-    """The map called "arctanh" or "box"."""
-    return ArctanhMap() if name == "arctanh" else BoxMap(half_side)
+    """The map called "arctanh", "box" or "prior"."""
+    if name == "arctanh":
+        return ArctanhMap()
+    return BoxMap(half_side) if name == "box" else PriorMap(half_side)
+
+
+def _inside(action: jax.Array) -> jax.Array:
+    return jnp.clip(action, -1 + MARGIN, 1 - MARGIN)

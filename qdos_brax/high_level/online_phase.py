@@ -17,7 +17,7 @@ from qdos_brax.data.device import DeviceData, MacroRows, Normaliser, macro_rows
 from qdos_brax.high_level import replay as replay_buffer
 from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.evaluation import Episodes, evaluate
-from qdos_brax.high_level.latent_map import LatentMap, latent_map
+from qdos_brax.high_level.latent_map import latent_map
 from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
 from qdos_brax.high_level.sac import SAC, Batch, SACHyper, SACState
 from qdos_brax.labels.offline_reward import OfflineReward
@@ -213,20 +213,19 @@ class OnlinePhase:
         """One macro step in every environment, stored; episodes that are over start anew."""
         num_envs = self._config.high_level.num_envs
         prior_key, actor_key, reset_key = jax.random.split(key, 3)
-        to_skill = self._latent_map(hyper)
+        agent = self._agent(state.learners.sac.actor, frozen["skills"], hyper)
         observation = self._normalise(state.env_state.obs)
-        prior = to_skill.to_action(gaussian_sample(prior_key, *self._model.prior(frozen["skills"], observation)))
+        prior = agent.prior(observation)
+        from_prior = agent.latent_map.to_action(gaussian_sample(prior_key, *prior), prior)
         action = self._sac.act(state.learners.sac.actor, actor_key, observation)
         warmup = state.env_steps < self._config.high_level.warmup_env_steps
-        action = jnp.where(warmup, prior, action)
-
-        agent = self._agent(state.learners.sac.actor, frozen["skills"], hyper)
+        action = jnp.where(warmup, from_prior, action)
         discount = hyper["high_level.discount"]
 
         def one(env_state: State, latent: jax.Array) -> tuple[State, MacroStep]:
             return macro_step(self._env, lambda obs: agent.play(obs, latent), env_state, self._horizon, discount)
 
-        env_state, result = jax.vmap(one)(state.env_state, to_skill.to_latent(action))
+        env_state, result = jax.vmap(one)(state.env_state, agent.latent_map.to_latent(action, prior))
         rows = OnlineRow(observation, action, result.reward, result.mask, self._normalise(result.next_observation))
         keys = jax.random.split(reset_key, num_envs)
         env_steps = state.env_steps + jnp.sum(result.steps)
@@ -300,7 +299,7 @@ class OnlinePhase:
         online_key, offline_key = jax.random.split(key)
         online = replay_buffer.sample(replay, online_key, self._config.high_level.batch_size - self._offline)
         index = jax.random.randint(offline_key, (self._offline,), 0, data.starts.shape[0])
-        action = self._latent_map(hyper).to_action(frozen["labels"][index])
+        action = frozen["labels"][index]
         discount = hyper["high_level.discount"]
         rows = macro_rows(data, data.starts[index], self._horizon, discount)
         reward, mask = self._labeller.label(learners.labeller, rows, action, discount)
@@ -332,10 +331,8 @@ class OnlinePhase:
         return state.replace(key=key, first_goal_step=first), episodes
 
     def _agent(self, actor: Any, skills: Any, hyper: dict[str, jax.Array]) -> Agent:
-        return Agent(self._normalise, self._model, self._sac, self._latent_map(hyper), skills, actor)
-
-    def _latent_map(self, hyper: dict[str, jax.Array]) -> LatentMap:
-        return latent_map(self._config.high_level.latent_map, hyper["skills.latent_box"])
+        to_skill = latent_map(self._config.high_level.latent_map, hyper["skills.latent_box"])
+        return Agent(self._normalise, self._model, self._sac, to_skill, skills, actor)
 
 
 def _all_finite(tree: Any) -> jax.Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
     return [
         *values,
         SkillPhase(config, data, hyper, model, weights, information),
-        LabelPhase(config, data, len(hyper["skills.alpha"]), model),
+        LabelPhase(config, data, hyper, model, partial(latent_map, config.high_level.latent_map)),
         OnlinePhase(config, env, data, normaliser, hyper, model, labeller),
     ]
 

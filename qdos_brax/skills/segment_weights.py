@@ -114,10 +114,14 @@ class LatentWeights:
         return {"params": params, "moments": moments}
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
-        """Smaller head of Q minus V, over the batch's standard deviation."""
-        q = self._q.apply(state["params"], self._inputs(batch)).min(axis=0)
-        advantage = latent_advantage(q, self._value(artifacts["value"], batch.rows.observation))
+        """``raw_advantage`` over the batch's standard deviation."""
+        advantage = self.raw_advantage(state, batch, artifacts)
         return advantage / (jnp.std(advantage) + 1e-6)
+
+    def raw_advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
+        """Smaller head of Q minus V, [B], in units of reward."""
+        q = self._q.apply(state["params"], self._inputs(batch)).min(axis=0)
+        return latent_advantage(q, self._value(artifacts["value"], batch.rows.observation))
 
     def _inputs(self, batch: SegmentBatch) -> jax.Array:
         return jax.lax.stop_gradient(jnp.concatenate([batch.rows.observation, batch.latent()], axis=-1))
