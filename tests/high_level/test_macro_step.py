@@ -7,7 +7,7 @@ import pytest
 from brax.envs.base import Env, State
 
 from qdos_brax.high_level.evaluation import evaluate
-from qdos_brax.high_level.latent_map import ArctanhMap, BoxMap
+from qdos_brax.high_level.latent_map import Prior, latent_map
 from qdos_brax.high_level.macro_step import macro_step, reset_done
 
 
@@ -95,13 +95,19 @@ def test_evaluation_plays_whole_episodes(goal, success, total, length):
     np.testing.assert_array_equal(episodes.length, [length] * 3)
 
 
-@pytest.mark.parametrize("mapping", [ArctanhMap(), BoxMap(2.0)])
-def test_latent_maps_are_inverses_and_labels_stay_inside(mapping):
+PRIOR = Prior(jnp.array([1.0, -1.0, 0.0]), jnp.log(jnp.array([0.5, 1.0, 2.0])))
+
+
+@pytest.mark.parametrize("name", ["arctanh", "box", "prior"])
+def test_latent_maps_are_inverses_and_labels_stay_inside(name):
+    mapping = latent_map(name, 2.0)
     u = jnp.array([-0.9, 0.0, 0.5])
-    np.testing.assert_allclose(mapping.to_action(mapping.to_latent(u)), u, atol=1e-6)
-    assert float(jnp.max(jnp.abs(mapping.to_action(jnp.array([50.0, -50.0]))))) < 1.0
+    np.testing.assert_allclose(mapping.to_action(mapping.to_latent(u, PRIOR), PRIOR), u, atol=1e-6)
+    assert float(jnp.max(jnp.abs(mapping.to_action(jnp.array([50.0, -50.0, 50.0]), PRIOR)))) < 1.0
 
 
 def test_latent_maps_by_hand():
-    np.testing.assert_allclose(ArctanhMap().to_latent(jnp.array([0.5])), 0.5493061, rtol=1e-5)
-    np.testing.assert_allclose(BoxMap(2.0).to_latent(jnp.array([0.5])), 1.0)
+    u = jnp.array([0.5, 0.5, 0.5])
+    np.testing.assert_allclose(latent_map("arctanh", 2.0).to_latent(u, PRIOR), [0.5493061] * 3, rtol=1e-5)
+    np.testing.assert_allclose(latent_map("box", 2.0).to_latent(u, PRIOR), [1.0] * 3)
+    np.testing.assert_allclose(latent_map("prior", 2.0).to_latent(u, PRIOR), [1.5, 0.0, 2.0], rtol=1e-6)

@@ -1,5 +1,7 @@
 """Phase 2 on the plane: it finds the goal, learns from what it should, and repeats."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 from qdos_brax import config as configs
 from qdos_brax.data.device import MacroRows, to_device
+from qdos_brax.high_level.latent_map import BoxMap, latent_map
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
@@ -27,7 +30,8 @@ def build(config, labeller=None):
     keys = jax.vmap(jax.random.key)(np.array([member["seed"] for member in configs.members(config)], np.uint32))
     skills = SkillPhase(config, data, hyper, model, UniformWeights(), None)
     artifacts = run(skills, keys, {})
-    artifacts = run(LabelPhase(config, data, len(keys), model), keys, artifacts)
+    to_skill = partial(latent_map, config.high_level.latent_map)
+    artifacts = run(LabelPhase(config, data, hyper, model, to_skill), keys, artifacts)
     phase = OnlinePhase(config, env, data, normaliser, hyper, model, labeller or DataReward(), steps_per_chunk=100)
     return phase, artifacts, keys
 
@@ -132,11 +136,12 @@ def test_labels_are_samples_of_the_posterior():
     encoder = jax.tree.map(jnp.zeros_like, params["encoder"])
     encoder["params"]["Dense_0"]["bias"] = jnp.array([1.0, -2.0, -5.0, -5.0])  # mean (1, -2), deviation exp(-5)
     artifacts = {"skills": jax.tree.map(lambda x: x[None], params | {"encoder": encoder})}
-    phase = LabelPhase(config, data, 1, model, chunk_size=1000)
+    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    phase = LabelPhase(config, data, hyper, model, lambda half_side: BoxMap(10.0), chunk_size=1000)
     assert phase.num_chunks > 1
     labels = run(phase, jax.vmap(jax.random.key)(np.zeros(1, np.uint32)), artifacts)["labels"]
     assert labels.shape == (1, data.starts.shape[0], 2)
-    np.testing.assert_allclose(labels[0], np.broadcast_to([1.0, -2.0], labels.shape[1:]), atol=0.05)
+    np.testing.assert_allclose(labels[0], np.broadcast_to([0.1, -0.2], labels.shape[1:]), atol=0.005)
 
 
 def rows(size=64):
