@@ -1,0 +1,1 @@
+"""Run folders, checkpoints, metrics and the loop over phases; nothing here knows a learner."""

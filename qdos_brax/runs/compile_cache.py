@@ -1,0 +1,50 @@
+"""The persistent compilation cache: a second run does not compile again what the first one compiled."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+import jax
+import jaxlib
+
+
+def cache_folder() -> Path:
+    """Where compiled programs lie: ``JAX_COMPILATION_CACHE_DIR``, or a folder per machine in the user's cache.
+
+    Programs are compiled for one processor; a home folder shared by several machines must keep them apart, or each
+    rejects the others' entries (jax issue 38445).
+    """
+    given = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if given:
+        return Path(given)
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return root / "qdos_brax" / "xla" / _machine()
+
+
+def enable() -> Path | None:
+    """Turns the cache on for every program from here on; None where its folder cannot be written."""
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    return folder
+
+
+def _machine() -> str:
+    """12 hex digits that name the processor and the compiler's version."""
+    cpu = platform.processor()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        cpu += "".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))}))
+    except OSError:
+        pass  # not Linux: the processor's name has to do
+    text = f"{platform.machine()} {cpu} jaxlib {jaxlib.__version__}"
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,0 +1,142 @@
+"""The run folder: what lies where, who may write to it, and how a file is written without ever being half there."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from qdos_brax.errors import UserError
+
+
+class RunFolder:
+    """One run's folder, held by one process at a time.
+
+    Attributes:
+        path: the folder.
+        config: config.yaml, whole and resolved.
+        metrics: metrics.csv, one row per member and log point.
+        provenance: run.json: the command, the data file's hash, the versions of the packages.
+        summary: summary.json, present once the run has ended.
+        curves: curves.png.
+        checkpoints: folder of the checkpoints.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.config = self.path / "config.yaml"
+        self.provenance = self.path / "run.json"
+        self.metrics = self.path / "metrics.csv"
+        self.summary = self.path / "summary.json"
+        self.curves = self.path / "curves.png"
+        self.checkpoints = self.path / "checkpoints"
+
+    @classmethod
+    def create(cls, path: str | Path) -> RunFolder:
+        """A new run folder; ``path`` must be absent, empty, or left by a run that had not begun to train.
+
+        Raises:
+            UserError: there is something else at ``path``, or it cannot be written.
+        """
+        folder = cls(path)
+        with user_errors(folder.path):
+            if folder.metrics.exists():
+                raise UserError(
+                    f"{folder.path} holds a run already; go on with --resume {folder.path} or choose another --out"
+                )
+            before_training = {folder.config, folder.provenance, folder.checkpoints, folder.path / ".lock"}
+            if folder.path.exists() and set(folder.path.iterdir()) - before_training:
+                raise UserError(f"{folder.path} is not empty; choose another --out")
+            folder.checkpoints.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunFolder:
+        """The folder of a run that was started before.
+
+        Raises:
+            UserError: there is no run at ``path``.
+        """
+        folder = cls(path)
+        if not folder.config.is_file():
+            raise UserError(f"{folder.path} is not a run folder: it has no config.yaml")
+        return folder
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Holds the folder for this process; the hold ends with the process, however that ends.
+
+        Raises:
+            UserError: another process holds it, or it cannot be written.
+        """
+        with user_errors(self.path):
+            descriptor = os.open(self.path / ".lock", os.O_CREAT | os.O_RDWR, 0o644)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(f"another process is at work in {self.path}; wait for it or stop it") from None
+            yield
+        finally:
+            os.close(descriptor)
+
+    def read_summary(self) -> dict[str, Any] | None:
+        """summary.json, or None where the run has not ended."""
+        if not self.summary.is_file():
+            return None
+        try:
+            content = json.loads(self.summary.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise UserError(f"cannot read {self.summary}: {error}; remove it and --resume writes it again") from error
+        return dict(content)
+
+
+def new_path(root: str | Path, name: str) -> Path:
+    """A folder under ``root`` that does not exist yet: the name and the time, numbered if taken."""
+    base = Path(root) / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    path, count = base, 1
+    while path.exists():
+        count += 1
+        path = base.with_name(f"{base.name}-{count}")
+    return path
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replaces ``path`` by ``text`` at once: a reader, or a run that goes on after a kill, sees the old or the new."""
+    with user_errors(path):
+        partial = path.with_name(f".{path.name}.partial")
+        with partial.open("w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+
+
+@contextlib.contextmanager
+def user_errors(path: Path) -> Iterator[None]:
+    """Turns what the file system refuses into one clear line."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(refusal(path, error)) from error
+
+
+def refusal(path: Path, error: OSError) -> str:
+    """The line for an OSError: what could not be written, why, and what helps."""
+    mends = {
+        errno.ENOSPC: "free some space and go on with --resume",
+        errno.EDQUOT: "free some space and go on with --resume",
+        errno.EROFS: "choose a folder that can be written, with --out",
+        errno.EACCES: "choose a folder that can be written, with --out",
+        errno.EPERM: "choose a folder that can be written, with --out",
+        errno.ENOTDIR: "choose another folder with --out",
+        errno.EEXIST: "choose another folder with --out",
+    }
+    mend = mends.get(error.errno or 0)
+    return f"cannot write {path}: {error.strerror or error}" + (f"; {mend}" if mend else "")

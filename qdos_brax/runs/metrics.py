@@ -1,0 +1,154 @@
+"""metrics.csv: one row per member and log point, and the summary that is read off it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qdos_brax.errors import UserError
+from qdos_brax.runs.folder import user_errors, write_text
+
+Row = dict[str, str]
+_FIRST = ("phase", "env_steps", "update", "eval/success", "eval/return")
+_LAST = "sps"
+
+
+class MetricsTable:
+    """The rows so far, in memory and on disk.
+
+    A column may appear late: the file is then rewritten at once with the new header, and earlier rows hold an empty
+    cell there. An absent number is an empty cell, never 0.
+
+    Args:
+        path: the CSV file.
+        members: what tells the members apart ("seed", "alpha", ...), in the population's order.
+    """
+
+    def __init__(self, path: Path, members: Sequence[Mapping[str, Any]]) -> None:
+        self._path = path
+        self._members = [{"member": str(i), **{k: _cell(v) for k, v in m.items()}} for i, m in enumerate(members)]
+        self.columns: list[str] = [*self._members[0], *_FIRST, _LAST]
+        self.rows: list[Row] = []
+        self._latest: list[dict[str, float]] = [{} for _ in members]
+
+    def start(self) -> None:
+        """Writes the header of a new table."""
+        self._rewrite()
+
+    def cut_back(self, rows: int, columns: Sequence[str]) -> None:
+        """Reads the file and keeps its first ``rows``, under the ``columns`` of that time.
+
+        Raises:
+            UserError: the file holds fewer rows than that, or none of those columns.
+        """
+        table = read_rows(self._path)
+        if len(table) < rows or (table and not set(columns) <= set(table[0])):
+            raise UserError(f"{self._path} has lost rows that the checkpoint counts ({len(table)} of {rows})")
+        self.columns = list(columns)
+        self.rows, self._latest = [], [{} for _ in self._members]
+        self._add([{name: row[name] for name in columns} for row in table[:rows]])
+        self._rewrite()
+
+    def append(self, phase: str, metrics: Mapping[str, Any], sps: float) -> None:
+        """Adds one row per member.
+
+        Args:
+            phase: the phase's name.
+            metrics: by column; each a scalar or one number per member.
+            sps: steps per second of one member.
+        """
+        count = len(self._members)
+        values = {name: np.broadcast_to(np.asarray(value), (count,)) for name, value in metrics.items()}
+        new = [name for name in values if name not in self.columns]
+        rows = []
+        for i, member in enumerate(self._members):
+            cells = {name: _cell(column[i]) for name, column in values.items()}
+            rows.append({**member, "phase": phase, **cells, _LAST: f"{sps:.1f}"})
+        self._add(rows)
+        if new:
+            self.columns[-1:] = [*new, _LAST]
+            self._rewrite()
+        else:
+            with user_errors(self._path), self._path.open("a", encoding="utf-8", newline="") as file:
+                file.write(self._text(rows))
+
+    def latest(self, column: str) -> list[float]:
+        """The last number of the column for each member; nan where there was none yet."""
+        return [latest.get(column, math.nan) for latest in self._latest]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """One entry per member, as summary.json holds it; what was never measured is None."""
+        return [self._member_summary(i) for i in range(len(self._members))]
+
+    def _member_summary(self, index: int) -> dict[str, Any]:
+        latest = self._latest[index]
+        cells = [row.get("eval/success") for row in self.rows if row["member"] == str(index)]
+        successes = [float(cell) for cell in cells if cell and cell != "nan"]
+        return {
+            **{key: _plain(text) for key, text in self._members[index].items() if key != "member"},
+            "env_steps": int(latest.get("env_steps", 0)),
+            "eval_success": _or_none(latest, "eval/success"),
+            "eval_return": _or_none(latest, "eval/return"),
+            "eval_episodes": _whole_or_none(latest, "eval/episodes"),
+            "best_success": max(successes, default=None),
+            "first_goal_step": _whole_or_none(latest, "first_goal_step"),
+            "status": "nan" if latest.get("status_ok") == 0 else "ok",
+        }
+
+    def _add(self, rows: Sequence[Row]) -> None:
+        names = {*self._members[0], "phase"}
+        for row in rows:
+            numbers = {name: float(cell) for name, cell in row.items() if cell and name not in names}
+            self._latest[int(row["member"])] |= numbers
+        self.rows += rows
+
+    def _rewrite(self) -> None:
+        write_text(self._path, ",".join(self.columns) + "\n" + self._text(self.rows))
+
+    def _text(self, rows: Sequence[Row]) -> str:
+        text = io.StringIO()
+        csv.DictWriter(text, self.columns, restval="", lineterminator="\n").writerows(rows)
+        return text.getvalue()
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a metrics file, without a last line that a kill left incomplete.
+
+    Raises:
+        UserError: the file is missing or is not a metrics file.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"cannot read {path}: {error}") from error
+    complete = text[: text.rfind("\n") + 1]
+    reader = csv.DictReader(io.StringIO(complete))
+    if "member" not in (reader.fieldnames or ()):
+        raise UserError(f"{path} is not a metrics file: it has no column 'member'")
+    return list(reader)
+
+
+def _cell(value: Any) -> str:
+    """A number as text: whole numbers exact, the others with the nine digits that tell float32 apart."""
+    number = np.asarray(value).item()
+    return str(int(number)) if isinstance(number, int | bool) else f"{number:.9g}"
+
+
+def _plain(text: str) -> float | int:
+    return int(text) if text.lstrip("-").isdigit() else float(text)
+
+
+def _or_none(numbers: Mapping[str, float], name: str) -> float | None:
+    number = numbers.get(name, math.nan)
+    return None if math.isnan(number) else number
+
+
+def _whole_or_none(numbers: Mapping[str, float], name: str) -> int | None:
+    number = _or_none(numbers, name)
+    return None if number is None else int(number)

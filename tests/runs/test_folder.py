@@ -1,0 +1,75 @@
+"""One process per run folder, and one line for what the file system refuses."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from qdos_brax.errors import UserError
+from qdos_brax.report.curves import draw_curves
+from qdos_brax.runs.folder import RunFolder, new_path, write_text
+from tests.runs import toy
+
+
+def made(path: Path) -> RunFolder:
+    folder = RunFolder.create(path)
+    write_text(folder.config, "env: antmaze-medium\n")
+    return folder
+
+
+def test_second_process_is_refused(tmp_path: Path) -> None:
+    folder = made(tmp_path / "run")
+    with folder.held(), pytest.raises(UserError, match="another process"), RunFolder.open(folder.path).held():
+        pass
+    with RunFolder.open(folder.path).held():
+        pass
+
+
+def test_a_run_is_not_overwritten(tmp_path: Path) -> None:
+    folder = made(tmp_path / "run")
+    RunFolder.create(folder.path)  # nothing was trained in it yet
+    write_text(folder.metrics, "member,seed\n")
+    with pytest.raises(UserError, match="holds a run already; go on with --resume"):
+        RunFolder.create(tmp_path / "run")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").touch()
+    with pytest.raises(UserError, match="not empty"):
+        RunFolder.create(tmp_path / "other")
+
+
+def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"cannot write .*choose another folder"):
+        RunFolder.create(tmp_path / "file" / "run")
+    with pytest.raises(UserError, match="not a run folder"):
+        RunFolder.open(tmp_path)
+
+
+def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "x.txt"
+    write_text(target, "old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError, match="No space left on device; free some space"):
+        write_text(target, "new")
+    assert target.read_text() == "old"
+
+
+def test_new_path_never_repeats(tmp_path: Path) -> None:
+    first = new_path(tmp_path, "a")
+    first.mkdir()
+    assert new_path(tmp_path, "a") != first
+
+
+def test_curves_are_drawn(tmp_path: Path) -> None:
+    toy.run(tmp_path / "run")
+    draw_curves([tmp_path / "run"], tmp_path / "one.png")
+    draw_curves([tmp_path / "run", tmp_path / "run"], tmp_path / "two.png")
+    assert (tmp_path / "one.png").stat().st_size > 10_000
+    assert (tmp_path / "one.png").read_bytes() != (tmp_path / "two.png").read_bytes()
