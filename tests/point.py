@@ -27,7 +27,7 @@ class PointEnv(Env):
     """x' = x + 0.1 a in the plane; success (read before the action) within 0.25 of (1, 0); starts near the origin."""
 
     goal_xy = GOAL
-    observation_size = 4
+    observation_size = 2
     action_size = 2
     episode_length = 60
     backend = "toy"
@@ -36,7 +36,7 @@ class PointEnv(Env):
         return self.reset_to(0.1 * jax.random.normal(rng, (2,)), jnp.zeros(2), GOAL, rng)
 
     def reset_to(self, qpos, qvel, goal_xy=None, key=None):
-        obs = jnp.concatenate([qpos, qvel])
+        obs = qpos
         info = {
             "truncation": jnp.zeros(()),
             "final_obs": obs,
@@ -48,7 +48,7 @@ class PointEnv(Env):
     def step(self, state, action):
         success = (jnp.linalg.norm(state.pipeline_state.qpos - GOAL) <= TOLERANCE).astype(jnp.float32)
         qpos = state.pipeline_state.qpos + STEP * jnp.clip(action, -1, 1)
-        obs = jnp.concatenate([qpos, action])
+        obs = qpos
         steps = state.info["steps"] + 1
         capped = (steps >= self.episode_length).astype(jnp.float32)
         return state.replace(
@@ -61,27 +61,26 @@ class PointEnv(Env):
         )
 
 
-def point_dataset(episodes: int = 40, length: int = 60, seed: int = 0) -> Dataset:
+def point_dataset(episodes: int = 200, length: int = 30, seed: int = 0) -> Dataset:
     """Straight walks in random directions that change every 15 steps, from random starts."""
     rng = np.random.default_rng(seed)
     angles = np.repeat(rng.uniform(-np.pi, np.pi, (episodes, length // 15)), 15, axis=1)
     actions = np.stack([np.cos(angles), np.sin(angles)], axis=-1) * 0.9 + 0.05 * rng.normal(size=(episodes, length, 2))
     actions = np.clip(actions, -1, 1).astype(np.float32)
-    start = rng.uniform(-1.5, 1.5, (episodes, 1, 2))
+    start = rng.uniform(-1.0, 1.0, (episodes, 1, 2))
     positions = np.concatenate([start, start + STEP * np.cumsum(actions, axis=1)], axis=1).astype(np.float32)
     previous = np.concatenate([np.zeros((episodes, 1, 2), np.float32), actions], axis=1)
-    observations = np.concatenate([positions, previous], axis=-1)
     success = np.linalg.norm(positions[:, :-1] - GOAL, axis=-1) <= TOLERANCE
     ends = np.zeros((episodes, length), bool)
     ends[:, -1] = True
     flat = lambda x: np.ascontiguousarray(x.reshape(episodes * length, *x.shape[2:]), np.float32)  # noqa: E731
     return Dataset(
-        observations=flat(observations[:, :-1]),
+        observations=flat(positions[:, :-1]),
         actions=flat(actions),
         rewards=flat(success - 1.0),
         masks=flat(1.0 - success),
         ends=ends.reshape(-1),
-        next_observations=flat(observations[:, 1:]),
+        next_observations=flat(positions[:, 1:]),
         qpos=flat(positions[:, :-1]),
         qvel=flat(previous[:, :-1]),
         source="the plane",

@@ -121,13 +121,14 @@ class OnlinePhase:
         self._evaluate_every = max(1, round(config.eval.every_env_steps / (self._iterations * per_iteration)))
 
         members = len(hyper["skills.alpha"])
+        self._start = jax.jit(jax.vmap(self._init))
         self._chunk = jax.jit(over_members(self._train, members), donate_argnums=0)
         self._evaluate = jax.jit(over_members(self._play_episodes, members))
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> OnlinePhaseState:
         """Fresh learners, empty replay, environments at their starts."""
         self._frozen = {"skills": artifacts["skills"], "labels": artifacts["labels"]}
-        return jax.jit(jax.vmap(self._init))(key, self._hyper)
+        return self._start(key, self._hyper)
 
     def chunk(self, state: OnlinePhaseState) -> tuple[OnlinePhaseState, dict[str, Any]]:
         """Some iterations, and an evaluation when one is due (always after the last chunk)."""

@@ -20,20 +20,36 @@ from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.vae import SkillModel
 from tests.point import PointEnv, point_config, point_dataset
 
+SKILLS = {"skills.updates": 600, "skills.learning_rate": 3e-3, "skills.kl_weight": 0.01}
 
-def build(config, labeller=None):
-    """(phase, artifacts, keys) with trained skills and labels of the plane."""
-    env, dataset = PointEnv(), point_dataset()
-    data, normaliser = to_device(dataset, config.skills.horizon)
+
+@pytest.fixture(scope="module")
+def plane():
+    """(data, normaliser, model, artifacts of one member with trained skills and labels)."""
+    config = point_config(**SKILLS)
+    data, normaliser = to_device(point_dataset(), config.skills.horizon)
     hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
-    model = SkillModel(4, 2, config.skills.latent_dim, 16, 1, (32, 32), (32, 32))
-    keys = jax.vmap(jax.random.key)(np.array([member["seed"] for member in configs.members(config)], np.uint32))
-    skills = SkillPhase(config, data, hyper, model, UniformWeights(), None)
-    artifacts = run(skills, keys, {})
+    model = SkillModel(2, 2, config.skills.latent_dim, 16, 1, (32, 32), (32, 32))
+    seeds = np.zeros(1, np.uint32)
+    artifacts = run(SkillPhase(config, data, hyper, model, UniformWeights(), None), phase_keys(seeds, 0), {})
     to_skill = partial(latent_map, config.high_level.latent_map)
-    artifacts = run(LabelPhase(config, data, hyper, model, to_skill), keys, artifacts)
-    phase = OnlinePhase(config, env, data, normaliser, hyper, model, labeller or DataReward(), steps_per_chunk=100)
-    return phase, artifacts, keys
+    artifacts = run(LabelPhase(config, data, hyper, model, to_skill), phase_keys(seeds, 1), artifacts)
+    return data, normaliser, model, artifacts
+
+
+def online_phase(plane, config):
+    """(phase, artifacts, keys) for the members of ``config``, on the shared skills."""
+    data, normaliser, model, artifacts = plane
+    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
+    phase = OnlinePhase(config, PointEnv(), data, normaliser, hyper, model, DataReward(), steps_per_chunk=100)
+    repeated = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), artifacts)
+    return phase, repeated, phase_keys(seeds, 2)
+
+
+def phase_keys(seeds, phase):
+    """Typed keys[members], fresh arrays for every phase: a phase donates what it is given."""
+    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), phase))(seeds)
 
 
 def run(phase, keys, artifacts):
@@ -44,40 +60,44 @@ def run(phase, keys, artifacts):
 
 
 @pytest.fixture(scope="module")
-def trained():
+def trained(plane):
     config = point_config(
+        **SKILLS,
         **{
-            "skills.updates": 600,
-            "skills.learning_rate": 3e-3,
-            "skills.kl_weight": 0.01,
-            "high_level.env_steps": 6000,
+            "high_level.env_steps": 4000,
             "high_level.utd": 8,
             "high_level.learning_rate": 1e-3,
             "high_level.target_rate": 0.02,
             "high_level.warmup_env_steps": 500,
             "labels.rnd_coefficient": 0.1,
             "eval.episodes": 20,
-            "eval.every_env_steps": 2000,
-        }
+            "eval.every_env_steps": 1000,
+        },
     )
-    phase, artifacts, keys = build(config)
+    phase, artifacts, keys = online_phase(plane, config)
     state = phase.init(keys, artifacts)
     history = []
     for _ in range(phase.num_chunks):
         state, metrics = phase.chunk(state)
         history.append(metrics)
-    return phase, state, history
+    return phase, state, history, artifacts
+
+
+@pytest.fixture(scope="module")
+def pair(plane):
+    """Two members: two seeds."""
+    return online_phase(plane, configs.replace(point_config(), seed=(0, 1)))
 
 
 def test_the_high_level_learns_to_reach_the_goal(trained):
-    _, _, history = trained
+    _, _, history, _ = trained
     evaluations = [float(m["eval/success"][0]) for m in history if "eval/success" in m]
     assert len(evaluations) >= 3
     assert evaluations[-1] >= 0.9, evaluations
 
 
 def test_first_goal_and_counts_are_kept(trained):
-    phase, state, history = trained
+    phase, state, history, _ = trained
     first = float(history[-1]["first_goal_step"][0])
     assert 0 < first <= float(history[-1]["env_steps"][0])
     assert int(state.replay.size[0]) <= phase._config.high_level.replay_capacity
@@ -85,13 +105,12 @@ def test_first_goal_and_counts_are_kept(trained):
 
 
 def test_a_phase_is_traced_once(trained):
-    phase, _, _ = trained
+    phase, _, _, _ = trained
     assert phase._chunk._cache_size() == 1
 
 
-def test_the_batch_is_half_offline_and_half_online():
-    phase, artifacts, keys = build(point_config())
-    state, _ = phase.chunk(phase.init(keys, artifacts))
+def test_the_batch_is_half_offline_and_half_online(trained):
+    phase, state, _, artifacts = trained
     member = jax.tree.map(lambda x: x[0], state)
     frozen = {"skills": None, "labels": artifacts["labels"][0]}
     hyper = {key: value[0] for key, value in phase._hyper.items()}
@@ -105,11 +124,10 @@ def test_the_batch_is_half_offline_and_half_online():
     assert all((row == online).all(axis=1).any() for row in second)
 
 
-def test_seeds_differ_and_repeat():
-    config = configs.replace(point_config(), seed=(0, 1))
+def test_seeds_differ_and_repeat(pair):
+    phase, artifacts, keys = pair
     results = []
     for _ in range(2):
-        phase, artifacts, keys = build(config)
         state, _ = phase.chunk(phase.init(keys, artifacts))
         results.append([np.asarray(leaf) for leaf in jax.tree.leaves(state.learners.sac.actor)])
     for a, b in zip(*results, strict=True):
@@ -117,21 +135,23 @@ def test_seeds_differ_and_repeat():
     assert any(not np.array_equal(a[0], a[1]) for a in results[0])
 
 
-def test_a_member_that_diverges_is_frozen_and_the_other_goes_on():
-    config = configs.replace(point_config(), **{"high_level.learning_rate": (1e-3, 1e-2)})
-    phase, artifacts, keys = build(config)
+def test_a_member_that_diverges_is_frozen_and_the_other_is_as_without_it(pair):
+    phase, artifacts, keys = pair
+    alone, _ = phase.chunk(phase.init(keys, artifacts))
     state = phase.init(keys, artifacts)
     broken = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.learners.sac.critic)
     learners = state.learners.replace(sac=state.learners.sac.replace(critic=broken))
     after, metrics = phase.chunk(state.replace(learners=learners))
     np.testing.assert_array_equal(metrics["status_ok"], [True, False])
-    assert all(np.isfinite(leaf[0]).all() for leaf in jax.tree.leaves(after.learners.sac.critic))
+    leaves = zip(jax.tree.leaves(alone.learners.sac), jax.tree.leaves(after.learners.sac), strict=True)
+    for expected, found in leaves:
+        np.testing.assert_array_equal(found[0], expected[0])
 
 
 def test_labels_are_samples_of_the_posterior():
     config = point_config()
     data, _ = to_device(point_dataset(), config.skills.horizon)
-    model = SkillModel(4, 2, 2, 16, 1, (32, 32), (32, 32))
+    model = SkillModel(2, 2, 2, 16, 1, (32, 32), (32, 32))
     params = model.init(jax.random.key(0))
     encoder = jax.tree.map(jnp.zeros_like, params["encoder"])
     encoder["params"]["Dense_0"]["bias"] = jnp.array([1.0, -2.0, -5.0, -5.0])  # mean (1, -2), deviation exp(-5)
@@ -139,7 +159,7 @@ def test_labels_are_samples_of_the_posterior():
     hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
     phase = LabelPhase(config, data, hyper, model, lambda half_side: BoxMap(10.0), chunk_size=1000)
     assert phase.num_chunks > 1
-    labels = run(phase, jax.vmap(jax.random.key)(np.zeros(1, np.uint32)), artifacts)["labels"]
+    labels = run(phase, phase_keys(np.zeros(1, np.uint32), 0), artifacts)["labels"]
     assert labels.shape == (1, data.starts.shape[0], 2)
     np.testing.assert_allclose(labels[0], np.broadcast_to([0.1, -0.2], labels.shape[1:]), atol=0.005)
 
@@ -168,8 +188,8 @@ def test_the_reward_model_learns_rewards_and_ends_and_waits_for_its_start():
     waiting = labeller.learn(state, batch, action, 1e-2, jnp.array(False))
     for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(waiting), strict=True):
         np.testing.assert_array_equal(a, b)
-    learn = jax.jit(lambda s: labeller.learn(s, batch, action, 1e-2, jnp.array(True)))
-    for _ in range(300):
+    learn = jax.jit(lambda s: labeller.learn(s, batch, action, 3e-3, jnp.array(True)))
+    for _ in range(1000):
         state = learn(state)
     reward, mask = labeller.label(state, batch, action, 0.9)
     assert float(jnp.mean((reward - batch.reward) ** 2)) < 0.05
@@ -189,10 +209,9 @@ def test_rnd_error_falls_where_it_was_trained_and_stays_elsewhere():
     state = rnd.init(jax.random.key(0))
     seen, new = jnp.zeros((64, 2)) + 0.1 * jax.random.normal(jax.random.key(1), (64, 2)), 3 * jnp.ones((64, 2))
     action = jnp.zeros((64, 1))
-    before = rnd.error(state.predictor, state.target, new, action).mean()
     update = jax.jit(lambda s: rnd.update(s, seen, action, 1e-3))
     for _ in range(300):
         state = update(state)
     known = rnd.error(state.predictor, state.target, seen, action).mean()
     unknown = rnd.error(state.predictor, state.target, new, action).mean()
-    assert float(known) < 0.05 * float(unknown) and float(unknown) > 0.2 * float(before)
+    assert float(known) < 0.01 * float(unknown)
