@@ -168,6 +168,7 @@ def rows(size=64):
     keys = jax.random.split(jax.random.key(0), 2)
     observation = jax.random.normal(keys[0], (size, 2))
     mask = (observation[:, 0] < 1).astype(jnp.float32)
+    observation = observation.at[:, 0].add(1 - mask)  # a gap, so that the border can be learned
     return MacroRows(observation, -2 * mask, mask, observation), jax.random.normal(keys[1], (size, 1))
 
 
