@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 from qdos_brax import __version__
 from qdos_brax.config import Config, load_config, nearest, presets
 from qdos_brax.errors import UserError
+from qdos_brax.methods import METHODS
 
 
 class Parser(argparse.ArgumentParser):
@@ -51,7 +52,8 @@ def train_parser() -> Parser:
         "--alpha", metavar="A[,A..]", help="weight of the mutual-information loss; several values make a scan"
     )
     parser.add_argument("--seed", metavar="S[,S..]", help="seed; several make a scan (default 0)")
-    parser.add_argument("--method", metavar="NAME", help="the method (default qdos)")
+    methods = "; ".join(f"{name}: {recipe.summary}" for name, recipe in METHODS.items())
+    parser.add_argument("--method", metavar="NAME", help=f"the method (default qdos). {methods}")
     parser.add_argument(
         "--preset",
         metavar="NAME",

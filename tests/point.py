@@ -61,10 +61,10 @@ class PointEnv(Env):
         )
 
 
-def point_dataset(episodes: int = 200, length: int = 30, seed: int = 0) -> Dataset:
-    """Straight walks in random directions that change every 15 steps, from random starts."""
+def point_dataset(episodes: int = 200, length: int = 30, seed: int = 0, spread: float = np.pi) -> Dataset:
+    """Straight walks in directions within ``spread`` of +x that change every 15 steps, from random starts."""
     rng = np.random.default_rng(seed)
-    angles = np.repeat(rng.uniform(-np.pi, np.pi, (episodes, length // 15)), 15, axis=1)
+    angles = np.repeat(rng.uniform(-spread, spread, (episodes, length // 15)), 15, axis=1)
     actions = np.stack([np.cos(angles), np.sin(angles)], axis=-1) * 0.9 + 0.05 * rng.normal(size=(episodes, length, 2))
     actions = np.clip(actions, -1, 1).astype(np.float32)
     start = rng.uniform(-1.0, 1.0, (episodes, 1, 2))
