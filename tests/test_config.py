@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from qdos_brax import config as configs
-from qdos_brax.config import Config, load_config
+from qdos_brax.config import Config, load_config, schema
 from qdos_brax.errors import UserError
 
 
@@ -44,7 +44,7 @@ def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (tmp_path / "antsoccer.yaml").write_text("")
     preset = "skills: {alpha: 0.4, kl_weight: 0.5, horizon: 8}\nfamilies: {antmaze: {skills: {kl_weight: 0.6}}}"
     (tmp_path / "presets" / "tiny.yaml").write_text(preset)
-    monkeypatch.setattr(configs, "CONFIG_DIR", tmp_path)
+    monkeypatch.setattr(configs.layers, "CONFIG_DIR", tmp_path)
     config = load_config("antmaze", "tiny", {"skills.alpha": "0.7", "skills.horizon": 6}, ["skills.alpha=0.8"])
     assert config.values.n_step == 5  # family over default
     assert config.skills.kl_weight == 0.6  # the preset's section over the preset over the family
@@ -53,11 +53,16 @@ def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert load_config("antsoccer", "tiny").skills.kl_weight == 0.5
 
 
+def _written(value: object) -> str:
+    """A value as a user types it after ``--set key=``."""
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value).lower()
+
+
 def test_every_key_can_be_set() -> None:
     """What ``to_yaml`` writes can be given back key by key."""
     config = load_config("antsoccer", "cpu")
-    plain = configs._flat(configs._plain(config))
-    sets = [f"{key}={str(value).lower()}" for key, value in plain.items() if value is not None]
+    plain = {key: schema.get(config, key) for key, _ in schema.leaves(Config)}
+    sets = [f"{key}={_written(value)}" for key, value in plain.items() if value is not None]
     sets = [text for text in sets if not text.startswith(("env=", "preset="))]
     assert load_config("antsoccer", "cpu", sets=sets) == config
 

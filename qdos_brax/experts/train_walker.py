@@ -39,6 +39,24 @@ class Sizes(NamedTuple):
     steps_per_chunk: int = 50
 
 
+class Walk(NamedTuple):
+    """What one control step of N ants brought.
+
+    Attributes:
+        after: the states it led to.
+        onward: the same, with every fallen ant stood up.
+        direction: float[N, 2], the directions commanded from here on.
+        speed: float[N], metres gained along the direction that was commanded.
+        alive: bool[N], False where the ant fell.
+    """
+
+    after: PipelineState
+    onward: PipelineState
+    direction: jax.Array
+    speed: jax.Array
+    alive: jax.Array
+
+
 class TrainState(struct.PyTreeNode):
     """Everything the loop carries."""
 
@@ -90,22 +108,20 @@ class Trainer:
     def chunk(self, state: TrainState, random_actions: bool) -> tuple[TrainState, dict[str, jax.Array]]:
         """``steps_per_chunk`` steps of every environment; with updates unless the actions are random."""
 
-        def step(state: TrainState, index: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
-            state, info = self._environment_step(state, index, random_actions)
+        def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+            state, info = self._environment_step(state, random_actions)
             if random_actions:
                 return state, info
             keys = jax.random.split(state.key, self.sizes.updates_per_step + 1)
             sac, losses = jax.lax.scan(partial(self._update, state.replay), state.sac, keys[1:])
             return state.replace(sac=sac, key=keys[0]), {**info, **jax.tree.map(jnp.mean, losses)}
 
-        state, info = jax.lax.scan(step, state, jnp.arange(self.sizes.steps_per_chunk))
+        state, info = jax.lax.scan(step, state, length=self.sizes.steps_per_chunk)
         return state, jax.tree.map(jnp.mean, info)
 
-    def _environment_step(
-        self, state: TrainState, index: jax.Array, random_actions: bool
-    ) -> tuple[TrainState, dict[str, jax.Array]]:
+    def _environment_step(self, state: TrainState, random_actions: bool) -> tuple[TrainState, dict[str, jax.Array]]:
         n = self.sizes.num_envs
-        act_key, reset_key, turn_key, turn_to_key, key = jax.random.split(state.key, 5)
+        act_key, walk_key, key = jax.random.split(state.key, 3)
         observe = jax.vmap(walker.canonical_observation)
         before = state.pipeline
         observation = observe(before.qpos, before.qvel, state.direction)
@@ -113,27 +129,38 @@ class Trainer:
             action = jax.random.uniform(act_key, (n, walker.ACTION_DIM), minval=-1.0)
         else:
             action = self.sac.act(state.sac.actor, act_key, observation)
-        after = jax.vmap(self.engine.step)(before, action)
-        speed = jnp.sum((after.qpos[:, :2] - before.qpos[:, :2]) * state.direction, axis=-1)
-        alive = walker.upright(after.qpos)
+        walk = self.walk(before, action, state.direction, walk_key)
         row = Batch(
             observation,
             action,
-            REWARD_SCALE * speed,
-            alive.astype(jnp.float32),
-            observe(after.qpos, after.qvel, state.direction),
+            REWARD_SCALE * walk.speed,
+            walk.alive.astype(jnp.float32),
+            observe(walk.after.qpos, walk.after.qvel, state.direction),
         )
+        state = state.replace(
+            replay=replay_buffer.insert(state.replay, row), pipeline=walk.onward, direction=walk.direction, key=key
+        )
+        return state, {"speed": jnp.mean(walk.speed), "falls_per_1000": 1000 * jnp.mean(1.0 - walk.alive)}
+
+    def walk(self, before: PipelineState, action: jax.Array, direction: jax.Array, key: jax.Array) -> Walk:
+        """One control step of N ants; the fallen are stood up, and now and then a direction is redrawn.
+
+        Args:
+            before: states [N].
+            action: float[N, 8].
+            direction: float[N, 2], unit vectors.
+            key: a fresh key.
+        """
+        n = direction.shape[0]
+        reset_key, turn_key, turn_to_key = jax.random.split(key, 3)
+        after = jax.vmap(self.engine.step)(before, action)
+        speed = jnp.sum((after.qpos[:, :2] - before.qpos[:, :2]) * direction, axis=-1)
+        alive = walker.upright(after.qpos)
         fresh = jax.vmap(self.reset)(jax.random.split(reset_key, n))
-        keep = lambda old, new: jnp.where(alive.reshape(n, *[1] * (old.ndim - 1)), old, new)  # noqa: E731
+        onward = jax.tree.map(lambda a, b: jnp.where(alive.reshape(n, *[1] * (a.ndim - 1)), a, b), after, fresh)
         turned = jax.vmap(random_direction)(jax.random.split(turn_to_key, n))
         turns = jax.random.uniform(turn_key, (n, 1)) < 1 / TURN_EVERY
-        state = state.replace(
-            replay=replay_buffer.insert(state.replay, row),
-            pipeline=jax.tree.map(keep, after, fresh),
-            direction=jnp.where(turns, turned, state.direction),
-            key=key,
-        )
-        return state, {"speed": jnp.mean(speed), "falls_per_1000": 1000 * jnp.mean(1.0 - alive)}
+        return Walk(after, onward, jnp.where(turns, turned, direction), speed, alive)
 
     def _update(
         self, replay: replay_buffer.Replay, sac: SACState, key: jax.Array
@@ -156,15 +183,8 @@ def evaluate(engine: MujocoEngine, policy: walker.WalkerPolicy, key: jax.Array, 
 
     def step(carry: tuple[PipelineState, jax.Array], key: jax.Array) -> tuple[Any, tuple[jax.Array, jax.Array]]:
         pipeline, direction = carry
-        turn_key, turn_to_key, reset_key = jax.random.split(key, 3)
-        after = jax.vmap(engine.step)(pipeline, policy.act(pipeline.qpos, pipeline.qvel, direction))
-        speed = jnp.sum((after.qpos[:, :2] - pipeline.qpos[:, :2]) * direction, axis=-1)
-        alive = walker.upright(after.qpos)
-        fresh = jax.vmap(trainer.reset)(jax.random.split(reset_key, num_envs))
-        after = jax.tree.map(lambda a, b: jnp.where(alive.reshape(-1, *[1] * (a.ndim - 1)), a, b), after, fresh)
-        turned = jax.vmap(random_direction)(jax.random.split(turn_to_key, num_envs))
-        turns = jax.random.uniform(turn_key, (num_envs, 1)) < 1 / TURN_EVERY
-        return (after, jnp.where(turns, turned, direction)), (jnp.mean(speed), jnp.mean(1.0 - alive))
+        walk = trainer.walk(pipeline, policy.act(pipeline.qpos, pipeline.qvel, direction), direction, key)
+        return (walk.onward, walk.direction), (jnp.mean(walk.speed), jnp.mean(1.0 - walk.alive))
 
     reset_key, direction_key, key = jax.random.split(key, 3)
     start = jax.vmap(trainer.reset)(jax.random.split(reset_key, num_envs))
@@ -177,7 +197,9 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="file for the weights (.npz), rewritten as it improves")
-    parser.add_argument("--steps", type=int, default=400_000, help="environment steps (default 400000)")
+    parser.add_argument(
+        "--steps", type=int, default=160_000, help="environment steps (default 160000)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)

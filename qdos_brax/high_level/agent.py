@@ -8,8 +8,8 @@ from typing import Any
 import jax
 
 from qdos_brax.data.device import Normaliser
-from qdos_brax.high_level.latent_map import LatentMap, Prior
 from qdos_brax.high_level.sac import SAC
+from qdos_brax.latent_map import LatentMap, Prior
 from qdos_brax.skills.vae import SkillModel
 
 

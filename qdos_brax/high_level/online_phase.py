@@ -17,11 +17,11 @@ from qdos_brax.data.device import DeviceData, MacroRows, Normaliser, macro_rows
 from qdos_brax.high_level import replay as replay_buffer
 from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.evaluation import Episodes, evaluate
-from qdos_brax.high_level.latent_map import latent_map
 from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
 from qdos_brax.high_level.sac import SAC, Batch, SACHyper, SACState
 from qdos_brax.labels.offline_reward import OfflineReward
 from qdos_brax.labels.rnd import RND, RNDState
+from qdos_brax.latent_map import latent_map
 from qdos_brax.networks import gaussian_sample
 from qdos_brax.population import over_members
 from qdos_brax.skills.vae import SkillModel

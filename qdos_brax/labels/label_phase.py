@@ -13,7 +13,7 @@ from flax import struct
 from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import window
-from qdos_brax.high_level.latent_map import LatentMap, Prior
+from qdos_brax.latent_map import LatentMap, Prior
 from qdos_brax.networks import gaussian_sample
 from qdos_brax.population import over_members
 from qdos_brax.skills.vae import Segments, SkillModel

@@ -18,12 +18,12 @@ from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.errors import UserError
 from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.evaluation import evaluate
-from qdos_brax.high_level.latent_map import latent_map
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.high_level.sac import SAC
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, OfflineReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
+from qdos_brax.latent_map import latent_map
 from qdos_brax.methods import METHODS, Recipe
 from qdos_brax.population import over_members
 from qdos_brax.runs.checkpoint import final_artifacts

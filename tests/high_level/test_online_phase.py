@@ -9,12 +9,12 @@ import pytest
 
 from qdos_brax import config as configs
 from qdos_brax.data.device import MacroRows, to_device
-from qdos_brax.high_level.latent_map import BoxMap, latent_map
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
+from qdos_brax.latent_map import BoxMap, latent_map
 from qdos_brax.skills.segment_weights import UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.vae import SkillModel

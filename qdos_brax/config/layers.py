@@ -1,0 +1,189 @@
+"""From YAML layers, flags and ``--set`` to one checked Config."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from qdos_brax.config.rules import convert, nearest
+from qdos_brax.config.schema import Config, leaves, plain
+from qdos_brax.errors import UserError
+
+# The folder beside the packages: the repository's root in an editable install, site-packages in a built wheel.
+CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"
+
+
+def load_config(
+    env: str, preset: str | None = None, flags: Mapping[str, Any] | None = None, sets: Sequence[str] = ()
+) -> Config:
+    """The configuration of a run.
+
+    Args:
+        env: the task's name; its first word is the family whose YAML applies.
+        preset: name of a preset; None takes ``default_preset()``.
+        flags: values by dotted key, as the command line's own flags give them.
+        sets: "key=value" texts; they win over everything else.
+
+    Returns:
+        The checked configuration.
+
+    Raises:
+        UserError: an unknown family, preset or key (the nearest is named), or a value out of its range.
+    """
+    family = env.split("-")[0]
+    if family not in families():
+        raise UserError(f"unknown task {env!r}{nearest(family, families())}; the families are {', '.join(families())}")
+    preset = preset or default_preset()
+    values: dict[str, Any] = {}
+    values |= _read_layer(CONFIG_DIR / f"{family}.yaml")
+    values |= _read_preset(preset, family)
+    values |= {"env": env, "preset": preset}
+    values |= _checked_keys(flags or {}, "a flag")
+    values |= dict(_parse_set(text) for text in sets)
+    return _build(values)
+
+
+def default_preset() -> str:
+    """The preset of this machine: "cpu" where jax has no accelerator, else "paper"."""
+    import jax  # here, because reading a configuration must not start a device
+
+    return "cpu" if jax.default_backend() == "cpu" else "paper"
+
+
+def families() -> list[str]:
+    """The task families that have a YAML."""
+    return sorted(path.stem for path in CONFIG_DIR.glob("*.yaml"))
+
+
+def presets() -> list[str]:
+    """The presets that have a YAML."""
+    return sorted(path.stem for path in (CONFIG_DIR / "presets").glob("*.yaml"))
+
+
+def from_yaml(path: str | Path) -> Config:
+    """The configuration that ``to_yaml`` wrote."""
+    return _build(_read_layer(Path(path)))
+
+
+def to_yaml(config: Config) -> str:
+    """The whole configuration as YAML text, in the order of the fields."""
+    return yaml.safe_dump(plain(config), sort_keys=False, default_flow_style=None, width=110)
+
+
+def replace(config: Config, **values: Any) -> Config:
+    """A copy with some values changed, checked; keys are dotted ("skills.alpha")."""
+    return _build(_flat(plain(config)) | _checked_keys(values, "replace()"))
+
+
+def config_hash(config: Config) -> str:
+    """16 hex digits over everything that decides the result: not the folders, and not the ``run`` group."""
+    content = plain(config)
+    for key in ("out", "dataset", "run"):
+        del content[key]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _read_layer(path: Path) -> dict[str, Any]:
+    """A YAML file as a flat dict by dotted key, its keys checked."""
+    return _checked_keys(_flat(_read_mapping(path)), str(path))
+
+
+def _read_preset(name: str, family: str) -> dict[str, Any]:
+    if name not in presets():
+        raise UserError(f"unknown preset {name!r}{nearest(name, presets())}; there are {', '.join(presets())}")
+    path = CONFIG_DIR / "presets" / f"{name}.yaml"
+    content = _read_mapping(path)
+    by_family = content.pop("families", None) or {}
+    for key in by_family:
+        if key not in families():
+            raise UserError(f"{path}: unknown family {key!r}{nearest(key, families())}")
+    layer = _checked_keys(_flat(content), str(path))
+    return layer | _checked_keys(_flat(by_family.get(family) or {}), str(path))
+
+
+def _read_mapping(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict | None):
+        raise UserError(f"{path} must hold keys and values, not a {type(content).__name__}")
+    return content or {}
+
+
+def _parse_set(text: str) -> tuple[str, Any]:
+    """("key", value) of "key=value"; the value is read as YAML."""
+    key, equals, value = text.partition("=")
+    key = key.strip()
+    if not equals or not key:
+        raise UserError(f"--set wants key=value, not {text!r}")
+    if key in ("env", "preset"):
+        raise UserError(f"--set {key} comes too late, it decides which values are read; use --{key}")
+    _checked_keys({key: None}, "--set")
+    try:
+        return key, yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise UserError(f"--set {key}: cannot read the value {value!r}") from error
+
+
+def _flat(nested: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in nested.items():
+        name = f"{prefix}{key}"
+        flat |= _flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
+def _checked_keys(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    known = [key for key, _ in leaves(Config)]
+    for key, value in values.items():
+        if key in known:
+            continue
+        if value is None and any(name.startswith(f"{key}.") for name in known):
+            raise UserError(f"{where}: {key} is a group of keys; give one, such as {_first_of_group(key, known)}")
+        raise UserError(f"{where}: unknown key {key!r}{nearest(key, known)}")
+    return dict(values)
+
+
+def _first_of_group(group: str, known: list[str]) -> str:
+    return next(name for name in known if name.startswith(f"{group}."))
+
+
+def _build(values: Mapping[str, Any]) -> Config:
+    """The Config of a flat dict by dotted key; what is absent keeps its default."""
+    checked = {key: convert(key, values[key], field) for key, field in leaves(Config) if key in values}
+    groups: dict[str, dict[str, Any]] = {}
+    top: dict[str, Any] = {}
+    for key, value in checked.items():
+        group, dot, name = key.partition(".")
+        if dot:
+            groups.setdefault(group, {})[name] = value
+        else:
+            top[key] = value
+    for group, entries in groups.items():
+        top[group] = dataclasses.replace(getattr(Config(), group), **entries)
+    config = Config(**top)
+    _check_together(config)
+    return config
+
+
+def _check_together(config: Config) -> None:
+    """Ranges that involve two fields."""
+    high = config.high_level
+    if high.target_subset > high.ensemble:
+        raise UserError(
+            f"high_level.target_subset ({high.target_subset}) must not exceed high_level.ensemble ({high.ensemble})"
+        )
+    if high.env_steps < config.skills.horizon * high.num_envs:
+        raise UserError(
+            f"high_level.env_steps ({high.env_steps}) is less than one macro step of every environment "
+            f"({config.skills.horizon} x {high.num_envs}); raise it with --steps"
+        )

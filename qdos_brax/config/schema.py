@@ -1,0 +1,263 @@
+"""The fields of a run's configuration, as frozen dataclasses; the defaults are the paper's values."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from qdos_brax.config.rules import Rule, choice, count, field, flag, number, rate, widths
+
+Scannable = float | tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """The data set that is collected when none is given.
+
+    Attributes:
+        transitions: environment steps to collect.
+        degraded_share: share of the episodes whose behaviour is made bad (heavy noise, wandering, failed attempts).
+        noise: standard deviation of the action noise of the other episodes (actions lie in [-1, 1]).
+        num_envs: environments stepped side by side.
+        seed: seed of the collection; apart from the learner's, so that every seed learns from the same data.
+    """
+
+    transitions: int = count(1_000_000)
+    degraded_share: float = number(0.5, high=1.0, scan=False)
+    noise: float = number(0.2, scan=False)
+    num_envs: int = count(64)
+    seed: int = count(0, low=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ValuesConfig:
+    """Implicit Q-learning on the data: Q, V, and from them the segments' advantages.
+
+    Attributes:
+        hidden: widths of the hidden layers of Q and V.
+        batch_size: transitions per gradient step.
+        learning_rate: Adam's.
+        expectile: tau of the expectile regression of V.
+        discount: per environment step.
+        target_rate: Polyak rate of the target critic.
+        n_step: environment steps of the bootstrapped return.
+        updates: gradient steps.
+    """
+
+    hidden: tuple[int, ...] = widths(256, 256)
+    batch_size: int = count(256)
+    learning_rate: Scannable = rate(3e-4)
+    expectile: Scannable = number(0.9, high=1.0, above=True)
+    discount: Scannable = number(0.99, high=1.0)
+    target_rate: Scannable = number(0.005, high=1.0, above=True)
+    n_step: int = count(10)
+    updates: int = count(100_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class SkillsConfig:
+    """The advantage-weighted trajectory VAE and the mutual information of its skills.
+
+    Attributes:
+        horizon: H, environment steps of a segment and of a macro step.
+        latent_dim: size of the skill z.
+        encoder_hidden: width of the bidirectional GRU (the posterior).
+        encoder_layers: its layers.
+        decoder_hidden: widths of the low-level policy's hidden layers.
+        prior_hidden: widths of the state prior's hidden layers.
+        batch_size: segments per gradient step.
+        learning_rate: Adam's.
+        kl_weight: beta, the weight of KL(posterior || prior).
+        kl_weighted: whether the advantage weight multiplies the KL too (Algorithm 1) or not (equation 4).
+        advantage: estimator of a segment's advantage; "segment" is the H-step return plus V(s_H) minus V(s_0),
+            "latent" is Q(s_0, z) - V(s_0), "transition" is the mean of Q(s_t, a_t) - V(s_t).
+        advantage_temperature: lambda in exp(A / lambda).
+        weight_clip: largest weight, after the batch's weights were brought to mean 1.
+        alpha: weight of the mutual-information loss.
+        mi_rollout: where skills are rolled out for that loss: "physics" (the simulator) or "logged" (the policy
+            along the data's states).
+        mi_every: gradient steps that one batch of rollouts serves.
+        mi_batch: rollouts in such a batch.
+        latent_box: half the side of the box that random skills are drawn from.
+        updates: gradient steps.
+    """
+
+    horizon: int = count(20)
+    latent_dim: int = count(8)
+    encoder_hidden: int = count(256)
+    encoder_layers: int = count(2)
+    decoder_hidden: tuple[int, ...] = widths(256, 256)
+    prior_hidden: tuple[int, ...] = widths(256, 256)
+    batch_size: int = count(256)
+    learning_rate: Scannable = rate(3e-4)
+    kl_weight: Scannable = number(0.1)
+    kl_weighted: bool = flag(True)
+    advantage: str = choice("segment", "segment", "latent", "transition")
+    advantage_temperature: Scannable = number(1.0, above=True)
+    weight_clip: Scannable = number(20.0, low=1.0)
+    alpha: Scannable = number(0.2)
+    mi_rollout: str = choice("physics", "physics", "logged")
+    mi_every: int = count(20)
+    mi_batch: int = count(64)
+    latent_box: Scannable = number(2.0, above=True)
+    updates: int = count(500_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class LabelsConfig:
+    """Pseudo-labels of the offline segments, and the bonus for novelty.
+
+    Attributes:
+        offline_reward: reward of an offline macro transition: the data's own ("data"), the lowest possible ("min"),
+            or the reward model's ("pred").
+        rnd_coefficient: weight of the random-network-distillation bonus.
+        rnd_hidden: widths of the hidden layers of its two networks.
+        rnd_features: size of their output.
+        rnd_learning_rate: Adam's.
+        reward_hidden: widths of the reward model's hidden layers.
+        reward_learning_rate: Adam's.
+        start_env_steps: environment steps before the bonus and the reward model are trained.
+    """
+
+    offline_reward: str = choice("data", "data", "min", "pred")
+    rnd_coefficient: Scannable = number(8.0)
+    rnd_hidden: tuple[int, ...] = widths(256, 256, 256)
+    rnd_features: int = count(256)
+    rnd_learning_rate: Scannable = rate(3e-4)
+    reward_hidden: tuple[int, ...] = widths(256, 256, 256)
+    reward_learning_rate: Scannable = rate(3e-4)
+    start_env_steps: int = count(10_000, low=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class HighLevelConfig:
+    """The high-level policy: SAC over skills, learned online.
+
+    Attributes:
+        hidden: widths of the hidden layers of actor and critics.
+        ensemble: critics.
+        target_subset: critics drawn for the target's minimum.
+        batch_size: macro transitions per gradient step.
+        offline_fraction: share of them taken from the labelled data.
+        utd: critic steps per macro step of experience.
+        learning_rate: Adam's, of actor, critics and temperature.
+        discount: per macro step.
+        target_rate: Polyak rate of the target critics.
+        init_temperature: first value of the entropy temperature.
+        target_entropy_scale: the target entropy is minus this times the latent dimension.
+        latent_map: from the action u in (-1, 1) to the skill z: "arctanh", "box" (z = latent_box * u), or "prior"
+            (z = mean + latent_box * standard deviation * u of the state prior).
+        num_envs: environments stepped side by side.
+        warmup_env_steps: first environment steps, acted by the state prior instead of the actor.
+        env_steps: environment steps of the online phase, over all environments.
+        replay_capacity: macro transitions kept.
+    """
+
+    hidden: tuple[int, ...] = widths(256, 256, 256)
+    ensemble: int = count(10)
+    target_subset: int = count(1)
+    batch_size: int = count(256, low=2)
+    offline_fraction: float = number(0.5, high=1.0, scan=False)
+    utd: int = count(20)
+    learning_rate: Scannable = rate(3e-4)
+    discount: Scannable = number(0.99, high=1.0)
+    target_rate: Scannable = number(0.005, high=1.0, above=True)
+    init_temperature: Scannable = number(0.05, above=True)
+    target_entropy_scale: Scannable = number(0.5)
+    latent_map: str = choice("arctanh", "arctanh", "box", "prior")
+    num_envs: int = count(1)
+    warmup_env_steps: int = count(5_000, low=0)
+    env_steps: int = count(200_000)
+    replay_capacity: int = count(100_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalConfig:
+    """Evaluation on environments of its own.
+
+    Attributes:
+        episodes: episodes per evaluation.
+        every_env_steps: online environment steps between two evaluations.
+    """
+
+    episodes: int = count(20)
+    every_env_steps: int = count(10_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """What changes where and how often a run writes, never what it computes.
+
+    Attributes:
+        checkpoint_seconds: seconds of work between two checkpoints; 0 saves after every chunk.
+        root: folder that holds the run folders whose place is not given with ``--out``.
+    """
+
+    checkpoint_seconds: float = number(30.0, scan=False)
+    root: str = field("runs", Rule("text"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """One run, whole.
+
+    Attributes:
+        env: the task's name, as ``envs.make`` takes it.
+        method: the name of a recipe in ``qdos_brax.methods``.
+        preset: the sizes that were laid over the task's values: "paper", "cpu" or "smoke".
+        seed: seeds; several make a scan.
+        physics: engine: "auto" (MuJoCo C on a CPU, MJX on an accelerator), "mjx" or "mujoco".
+        dataset: a data file, or None to collect the task's default set.
+        out: the run folder, or None to name one under ``run.root``.
+        data: collection.
+        values: implicit Q-learning.
+        skills: trajectory VAE.
+        labels: pseudo-labels.
+        high_level: online learner.
+        eval: evaluation.
+        run: writing.
+    """
+
+    env: str = field("antmaze", Rule("text"))
+    method: str = field("qdos", Rule("text"))
+    preset: str = field("paper", Rule("text"))
+    seed: tuple[int, ...] = field((0,), Rule("seeds", low=0, high=2**32 - 1))
+    physics: str = choice("auto", "auto", "mjx", "mujoco")
+    dataset: str | None = field(None, Rule("path"))
+    out: str | None = field(None, Rule("path"))
+    data: DataConfig = DataConfig()
+    values: ValuesConfig = ValuesConfig()
+    skills: SkillsConfig = SkillsConfig()
+    labels: LabelsConfig = LabelsConfig()
+    high_level: HighLevelConfig = HighLevelConfig()
+    eval: EvalConfig = EvalConfig()
+    run: RunConfig = RunConfig()
+
+
+def leaves(kind: type[Any], prefix: str = "") -> Iterator[tuple[str, dataclasses.Field[Any]]]:
+    """(dotted key, field) of every value, in order."""
+    for leaf in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(leaf.default):
+            yield from leaves(type(leaf.default), f"{prefix}{leaf.name}.")
+        else:
+            yield f"{prefix}{leaf.name}", leaf
+
+
+def get(config: Config, key: str) -> Any:
+    """The value under a dotted key."""
+    node: Any = config
+    for name in key.split("."):
+        node = getattr(node, name)
+    return node
+
+
+def plain(config: Config) -> dict[str, Any]:
+    """Nested dicts with lists for tuples: what YAML and JSON can hold."""
+
+    def listed(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: listed(item) for key, item in value.items()}
+        return [listed(item) for item in value] if isinstance(value, tuple) else value
+
+    return {key: listed(value) for key, value in dataclasses.asdict(config).items()}
