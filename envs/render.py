@@ -77,6 +77,7 @@ class Renderer:
         self._model.vis.global_.offheight = height
         self._model.vis.global_.offwidth = width
         self._data = mujoco.MjData(self._model)
+        self.height, self.width = height, width
         fovy = self._model.vis.global_.fovy
         self._camera = _top_camera(env.layout, fovy, width / height) if camera == "top" else _follow_camera()
         self._scene = mujoco.MjvScene(self._model, _MAX_GEOMS)
@@ -99,7 +100,7 @@ class Renderer:
         )
         self._gl.make_current()  # another renderer may have been at work in this thread
         mujoco.mjr_render(self._viewport, self._scene, self._context)
-        image = np.empty((self._viewport.height, self._viewport.width, 3), np.uint8)
+        image = np.empty((self.height, self.width, 3), np.uint8)
         mujoco.mjr_readPixels(image, None, self._viewport, self._context)
         return image[::-1].copy()  # OpenGL counts rows from below
 

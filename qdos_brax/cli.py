@@ -155,6 +155,9 @@ def main_parser(argv: Sequence[str]) -> Parser:
     evaluate.add_argument(
         "--episodes", metavar="N", type=_positive, default=20, help="episodes per member (default 20)"
     )
+    evaluate.add_argument(
+        "--video", metavar="FILE", help="also film the first member's first episode, as .mp4; takes one RUN"
+    )
     evaluate.set_defaults(run=_evaluate)
 
     report = commands.add_parser("report", help="draw the learning curves of runs")
@@ -163,6 +166,11 @@ def main_parser(argv: Sequence[str]) -> Parser:
         "--out", metavar="FILE", help="the picture (default: curves.png, in the folder of a single run)"
     )
     report.set_defaults(run=_report)
+
+    picture = commands.add_parser("picture", help="draw a task at its start")
+    picture.add_argument("task", metavar="TASK", help="a task, as listed by: python -m qdos_brax tasks")
+    picture.add_argument("--out", metavar="FILE", required=True, help="the picture, as .png")
+    picture.set_defaults(run=_picture)
 
     tasks = commands.add_parser("tasks", help="list the tasks and their aliases")
     tasks.set_defaults(run=_tasks)
@@ -173,10 +181,18 @@ def main_parser(argv: Sequence[str]) -> Parser:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
+    if args.video and len(args.runs) > 1:
+        raise UserError(f"--video films one run, and {len(args.runs)} were given; name one RUN")
+
     from qdos_brax import train_flow
     from qdos_brax.methods.build import evaluate_run
 
     train_flow.prepare_jax()
+    if args.video:
+        from qdos_brax.methods.film import film_run
+
+        episode = film_run(Path(args.runs[0]), Path(args.video))
+        print(f"{args.video}: " + ", ".join(f"{name} {value:g}" for name, value in episode.items()), flush=True)
     for run in args.runs:
         for member in evaluate_run(Path(run), args.episodes):
             print(f"{run}: " + ", ".join(f"{name} {value:g}" for name, value in member.items()))
@@ -190,6 +206,14 @@ def _report(args: argparse.Namespace) -> int:
     out = Path(args.out) if args.out else (runs[0] if len(runs) == 1 else Path()) / "curves.png"
     draw_curves(runs, out)
     print(out)
+    return 0
+
+
+def _picture(args: argparse.Namespace) -> int:
+    from qdos_brax.report.picture import draw_task
+
+    draw_task(args.task, Path(args.out))
+    print(args.out)
     return 0
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +76,66 @@ def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
     ]
 
 
+class TrainedRun(NamedTuple):
+    """What a finished run has learned.
+
+    Attributes:
+        config: the run's configuration.
+        env: its task.
+        artifacts: parameters with a leading member axis.
+        hyper: what a scan may vary, by dotted key, with a leading member axis.
+        agent: (artifacts, hyper) of one member -> its agent.
+    """
+
+    config: Config
+    env: Any
+    artifacts: Any
+    hyper: dict[str, jax.Array]
+    agent: Callable[[Any, Any], Agent]
+
+
+def load_run(run: Path) -> TrainedRun:
+    """The agents of a finished run.
+
+    Args:
+        run: the run folder.
+
+    Raises:
+        UserError: it is no run folder, or the run has not ended.
+    """
+    folder = RunFolder.open(str(run))
+    config = configs.from_yaml(folder.config)
+    if folder.read_summary() is None:
+        raise UserError(f"the run in {run} has not ended; go on with: python train.py --resume {run}")
+    env = envs.make(config.env, physics=config.physics)
+    high = config.high_level
+    sac = SAC(env.observation_size, config.skills.latent_dim, high.hidden, high.ensemble, high.target_subset)
+    model = _skill_model(config, env)
+
+    def agent(artifacts: Any, hyper: Any) -> Agent:
+        return Agent(
+            normaliser=Normaliser(**artifacts["normaliser"]),
+            model=model,
+            sac=sac,
+            latent_map=latent_map(high.latent_map, hyper["skills.latent_box"]),
+            skills=artifacts["skills"],
+            actor=artifacts["actor"],
+        )
+
+    return TrainedRun(
+        config,
+        env,
+        final_artifacts(folder.checkpoints, configs.config_hash(config)),
+        {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()},
+        agent,
+    )
+
+
+def evaluation_key() -> jax.Array:
+    """For starts that no training or evaluation of a run has seen: a key of its own, the same for every member."""
+    return jax.random.key(2**32 - 1)
+
+
 def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
     """Plays whole episodes with the agents of a finished run.
 
@@ -88,31 +149,14 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
     Raises:
         UserError: it is no run folder, or the run has not ended.
     """
-    folder = RunFolder.open(str(run))
-    config = configs.from_yaml(folder.config)
-    if folder.read_summary() is None:
-        raise UserError(f"the run in {run} has not ended; go on with: python train.py --resume {run}")
-    env = envs.make(config.env, physics=config.physics)
-    artifacts = final_artifacts(folder.checkpoints, configs.config_hash(config))
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
-    members = configs.members(config)
-    high = config.high_level
-    sac = SAC(env.observation_size, config.skills.latent_dim, high.hidden, high.ensemble, high.target_subset)
-    model = _skill_model(config, env)
+    trained = load_run(run)
+    members = configs.members(trained.config)
 
     def play(artifacts: Any, hyper: Any, key: jax.Array) -> Any:
-        agent = Agent(
-            normaliser=Normaliser(**artifacts["normaliser"]),
-            model=model,
-            sac=sac,
-            latent_map=latent_map(high.latent_map, hyper["skills.latent_box"]),
-            skills=artifacts["skills"],
-            actor=artifacts["actor"],
-        )
-        return evaluate(env, agent.choose, agent.play, key, episodes, config.skills.horizon)
+        agent = trained.agent(artifacts, hyper)
+        return evaluate(trained.env, agent.choose, agent.play, key, episodes, trained.config.skills.horizon)
 
-    # Starts that no training or evaluation of the run has seen: a key of its own, the same for every member.
-    result = jax.jit(over_members(play, len(members)))(artifacts, hyper, jax.random.key(2**32 - 1))
+    result = jax.jit(over_members(play, len(members)))(trained.artifacts, trained.hyper, evaluation_key())
     means = {
         "success": np.asarray(result.success).mean(axis=-1),
         "return": np.asarray(result.episode_return).mean(axis=-1),

@@ -1,0 +1,36 @@
+"""The picture of a task, as a PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import matplotlib.image
+
+import envs
+from envs.render import NoOpenGL, Renderer
+from qdos_brax.errors import UserError
+from qdos_brax.runs.folder import user_errors
+
+
+def draw_task(name: str, out: Path) -> None:
+    """Draws the maze of a task from above, with the body at a start and the target at the goal.
+
+    Args:
+        name: of the task.
+        out: the picture, ending in .png; its folder must exist.
+
+    Raises:
+        UserError: there is no such task, this machine cannot draw, or the picture cannot be written.
+    """
+    if out.suffix != ".png":
+        raise UserError(f"a picture is written as .png, not as {out.name}; choose another name for it")
+    try:
+        env = envs.make(name, physics="mujoco")
+        state = env.reset(jax.random.key(0))
+        with Renderer(env, height=720) as renderer:
+            image = renderer.frame(state.pipeline_state.qpos, state.info["goal_xy"])
+    except (ValueError, NoOpenGL) as error:  # envs knows nothing of UserError; its lines are made for the user
+        raise UserError(str(error)) from error
+    with user_errors(out):
+        matplotlib.image.imsave(out, image)
