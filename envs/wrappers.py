@@ -46,9 +46,9 @@ class AutoReset(Env):
     def unwrapped(self) -> Env:
         return self.env.unwrapped
 
-    def reset(self, rng: jax.Array) -> State:
-        """The first episode's start; ``rng`` is a typed key."""
-        return _with_nan_count(self.env.reset(rng))
+    def reset(self, rng: jax.Array, **options: Any) -> State:
+        """The first episode's start; ``rng`` is a typed key, ``options`` are those of the task's ``reset``."""
+        return _with_nan_count(self.env.reset(rng, **options))
 
     def reset_to(self, *args: Any, **kwargs: Any) -> State:
         """As the task's ``reset_to``."""

@@ -1,0 +1,328 @@
+"""The tasks for learners that speak Gymnasium: NumPy in, NumPy out.
+
+Importing this module registers every task: ``qdos/antmaze-large-v0`` with its default task and
+``qdos/antmaze-large-task3-v0`` with that one. ``gymnasium.make`` gives one environment, ``gymnasium.make_vec`` a batch
+of them that one compiled program steps, on MuJoCo C (in threads) or MJX.
+
+Observation, reward, success and cap are the task's: success, read on the state before the action, terminates an
+episode, the cap truncates it. Environment 0 of a batch starts as the single one with the same seed.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from envs.registry import get_spec, list_tasks, make
+from envs.render import Renderer, steps_per_second
+from envs.task import TaskEnv
+from envs.wrappers import AutoReset
+
+_METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10.0}
+
+
+class TaskGymEnv(gymnasium.Env):
+    """One environment.
+
+    ``info["success"]`` (bool) tells of the step just made. Physics that is no longer finite truncates the episode, with
+    the last finite observation.
+
+    Args:
+        task: a name that ``envs.make`` knows.
+        physics: "mjx", "mujoco", or "auto": MuJoCo C where jax has only a CPU, MJX on an accelerator.
+        render_mode: None or "rgb_array".
+        **frames: height, width and camera of frames, as ``envs.render.Renderer`` takes them.
+
+    Attributes:
+        task: the Brax environment behind it.
+
+    Raises:
+        ValueError: unknown task, engine, render mode or camera; the message names the choices.
+        NoOpenGL: frames are wanted and this machine cannot draw.
+    """
+
+    metadata = _METADATA
+
+    def __init__(self, task: str, physics: str = "auto", render_mode: str | None = None, **frames: Any) -> None:
+        self._programs = _programs(get_spec(task).full_name, physics)
+        self.task = self._programs.task
+        self.observation_space, self.action_space = self._programs.spaces
+        self.metadata = _METADATA | {"render_fps": steps_per_second(self.task)}
+        self.render_mode = render_mode
+        self._renderer = _renderer(self.task, render_mode, frames)
+        self._state: State | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """The start of an episode: observation float32[obs] and info.
+
+        Args:
+            seed: makes everything from here on repeatable; None goes on with the random numbers of the last seed.
+            options: keyword arguments for the task's own ``reset``.
+
+        Raises:
+            ValueError: it knows no such option.
+        """
+        super().reset(seed=seed)
+        self._state = self._programs.start(self.np_random, 1, options)
+        return np.array(self._state.obs)[0], {"success": False}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One control step under ``action[act]``, which the motors clip to [-1, 1].
+
+        Raises:
+            ValueError: the action's shape is wrong or it is not finite.
+        """
+        state = _started(self._state)
+        self._state, out = self._programs.step(state, _checked(action, self.action_space)[None])
+        out = _to_numpy(out)
+        finite = bool(np.isfinite(out.obs).all())
+        return (
+            out.obs[0] if finite else np.array(state.obs)[0],
+            float(out.reward[0]),
+            bool(out.terminated[0]) and finite,
+            bool(out.truncated[0]) or not finite,
+            {"success": bool(out.success[0])},
+        )
+
+    def render(self) -> np.ndarray | None:
+        """The state as uint8[height, width, 3]; None without a render mode."""
+        if self._renderer is None:
+            return None
+        return _frames(self._renderer, _started(self._state))[0]
+
+    def close(self) -> None:
+        """Gives the OpenGL context back."""
+        if self._renderer is not None:
+            self._renderer.close()
+
+
+class TaskVectorEnv(gymnasium.vector.VectorEnv):
+    """A batch of environments, stepped by one compiled program.
+
+    An environment whose episode ends starts the next one in the same step (``AutoresetMode.SAME_STEP``): the true last
+    observation is in ``infos["final_obs"]``, what the last step has to tell in ``infos["final_info"]``. Physics that is
+    no longer finite truncates, as in ``TaskGymEnv``, whose arguments are the same.
+
+    Args:
+        task: a name that ``envs.make`` knows.
+        num_envs: how many.
+        physics: the engine.
+        render_mode: None or "rgb_array".
+        **frames: as in ``TaskGymEnv``.
+
+    Attributes:
+        task: the Brax environment behind it, unbatched.
+
+    Raises:
+        ValueError: there is no environment at all, or as in ``TaskGymEnv``.
+        NoOpenGL: frames are wanted and this machine cannot draw.
+    """
+
+    metadata = _METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self, task: str, num_envs: int = 1, physics: str = "auto", render_mode: str | None = None, **frames: Any
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+        self.num_envs = num_envs
+        self._programs = _programs(get_spec(task).full_name, physics)
+        self.task = self._programs.task
+        self.single_observation_space, self.single_action_space = self._programs.spaces
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.metadata = self.metadata | {"render_fps": steps_per_second(self.task)}
+        self.render_mode = render_mode
+        self._renderer = _renderer(self.task, render_mode, frames)
+        self._state: State | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Fresh episodes everywhere: observations float32[N, obs] and infos.
+
+        Args:
+            seed: one number, for all; see ``TaskGymEnv.reset``.
+            options: keyword arguments for the task's own ``reset``, the same for all; episodes that start by
+                themselves later on start without them.
+
+        Raises:
+            ValueError: it knows no such option.
+        """
+        super().reset(seed=seed)
+        self._state = self._programs.start(self.np_random, self.num_envs, options)
+        return np.array(self._state.obs), {"success": np.zeros(self.num_envs, bool), "_success": self._everywhere()}
+
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control step under ``actions[N, act]``: observations, rewards, terminations, truncations, infos.
+
+        Raises:
+            ValueError: the actions' shape is wrong or they are not finite.
+        """
+        state = _started(self._state)
+        self._state, out = self._programs.auto_step(state, _checked(actions, self.action_space))
+        out = _to_numpy(out)
+        done = out.terminated | out.truncated
+        # As gymnasium's own vector environments: where an episode has ended, infos are those of the new one's reset.
+        infos: dict[str, Any] = {"success": out.success & ~done, "_success": self._everywhere()}
+        if done.any():
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            for index in np.flatnonzero(done):
+                final_obs[index] = out.final_obs[index].copy()
+            infos |= {
+                "final_obs": final_obs,
+                "_final_obs": done.copy(),
+                "final_info": {"success": out.success & done, "_success": done.copy()},
+                "_final_info": done.copy(),
+            }
+        return out.obs, out.reward, out.terminated, out.truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Every environment's state as uint8[height, width, 3]; None without a render mode."""
+        return None if self._renderer is None else _frames(self._renderer, _started(self._state))
+
+    def close_extras(self) -> None:
+        """Gives the OpenGL context back."""
+        if self._renderer is not None:
+            self._renderer.close()
+
+    def _everywhere(self) -> np.ndarray:
+        return np.ones(self.num_envs, bool)
+
+
+class _Outcome(NamedTuple):
+    """What one control step brought; leading axis N. ``obs`` is after the reset where there was one."""
+
+    obs: Any
+    final_obs: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+    success: Any
+
+
+_Step = Callable[[State, np.ndarray], tuple[State, _Outcome]]
+
+
+class _Programs(NamedTuple):
+    """The compiled parts of one task on one engine, shared by all environments of it; batched.
+
+    Attributes:
+        task: the environment.
+        spaces: of observations and of actions.
+        start: (random numbers, N, options) -> states.
+        step: leaves ended episodes as they are.
+        auto_step: starts the next episodes.
+    """
+
+    task: TaskEnv
+    spaces: tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]
+    start: Callable[[np.random.Generator, int, Mapping[str, Any] | None], State]
+    step: _Step
+    auto_step: _Step
+
+
+@functools.cache
+def _programs(full_name: str, physics: str) -> _Programs:
+    # Must be said before jax is first used: MuJoCo C is called back from compiled programs, and with asynchronous
+    # dispatch on a CPU such a callback can wait for ever on arrays that wait for it (jax issue 25861).
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    task = make(full_name, physics=physics)
+    auto = AutoReset(task)
+    limits = np.full(task.observation_size, np.inf, np.float32)
+    spaces = (
+        gymnasium.spaces.Box(-limits, limits),
+        gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32),
+    )
+    known = [name for name in inspect.signature(task.reset).parameters if name not in ("rng", "key")]
+
+    def start_plainly(key: jax.Array, num_envs: int, options: Mapping[str, Any]) -> State:
+        keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(num_envs))
+        return jax.vmap(lambda key: auto.reset(key, **options))(keys)
+
+    start_compiled = jax.jit(functools.partial(start_plainly, options={}), static_argnames="num_envs")
+
+    def start(random: np.random.Generator, num_envs: int, options: Mapping[str, Any] | None) -> State:
+        key = jax.random.key(int(random.integers(2**32)))
+        if not options:
+            return start_compiled(key, num_envs)
+        for name in options:
+            if name not in known:
+                raise ValueError(f"{full_name} has no reset option {name!r}; options: {', '.join(known) or 'none'}")
+        return start_plainly(key, num_envs, options)
+
+    def step(env: TaskEnv | AutoReset, state: State, actions: jax.Array) -> tuple[State, _Outcome]:
+        after = jax.vmap(env.step)(state, actions)
+        truncated = after.info["truncation"] > 0
+        terminated = (after.done > 0) & ~truncated
+        success = after.metrics["success"] > 0
+        return after, _Outcome(after.obs, after.info["final_obs"], after.reward, terminated, truncated, success)
+
+    return _Programs(
+        task, spaces, start, jax.jit(functools.partial(step, task)), jax.jit(functools.partial(step, auto))
+    )
+
+
+def _checked(actions: Any, space: gymnasium.Space) -> np.ndarray:
+    """The actions as float32.
+
+    Raises:
+        ValueError: they are not of ``space.shape`` or not finite.
+    """
+    array = np.asarray(actions, np.float32)
+    if array.shape != space.shape:
+        raise ValueError(f"actions have the shape {array.shape}; this environment takes {space.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError("actions are not finite; look at the policy that gave them")
+    return array
+
+
+def _to_numpy(out: _Outcome) -> _Outcome:
+    """Copies that a caller may keep and change; rewards in float64, as gymnasium has them."""
+    arrays = _Outcome(*(np.array(value) for value in jax.device_get(out)))
+    return arrays._replace(reward=arrays.reward.astype(np.float64))
+
+
+def _started(state: State | None) -> State:
+    if state is None:
+        raise ValueError("the environment has no state yet; call reset() first")
+    return state
+
+
+def _renderer(task: TaskEnv, render_mode: str | None, frames: Mapping[str, Any]) -> Renderer | None:
+    if render_mode is None:
+        return None
+    if render_mode not in _METADATA["render_modes"]:
+        raise ValueError(f"there is no render mode {render_mode!r}; choose rgb_array or None")
+    return Renderer(task, **frames)
+
+
+def _frames(renderer: Renderer, state: State) -> tuple[np.ndarray, ...]:
+    states = zip(np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal_xy"]), strict=True)
+    return tuple(renderer.frame(qpos, goal_xy) for qpos, goal_xy in states)
+
+
+def _register() -> None:
+    names = {spec.full_name for spec in list_tasks()} | {spec.name for spec in list_tasks()}
+    for name in sorted(names):
+        gymnasium.register(
+            f"qdos/{name}-v0",
+            entry_point=f"{__name__}:TaskGymEnv",
+            vector_entry_point=f"{__name__}:TaskVectorEnv",
+            kwargs={"task": name},
+        )
+
+
+_register()
