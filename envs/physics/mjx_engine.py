@@ -8,6 +8,8 @@ with the whole maze, to rounding. The ball has three boxes of its own, kept apar
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -18,15 +20,36 @@ from envs.maze import UNIT, WALL_HALF_SIZE, Maze
 from envs.models import near_walls_model
 from envs.physics.base import PipelineState
 from envs.physics.contacts import exact_contacts
+from envs.physics.solver import solve
 
 _SUNK = -10.0  # height of a box that stands for no wall: below the floor, out of reach
 _BALL_QPOS = 15
 
-_Substep = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, warm start
-_Stage = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # rate and acceleration of a stage, their means so far
+# Runge-Kutta of order 4: where each stage is evaluated, its share, and whether it is the sub-step's last.
+_STAGES = np.array([[0.0, 1 / 6, 0], [0.5, 1 / 3, 0], [0.5, 1 / 3, 0], [1.0, 1 / 6, 1]], np.float32)
 
-# Runge-Kutta of order 4: where each stage is evaluated, and its share.
-_STAGES = np.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], np.float32)
+
+class _Stage(NamedTuple):
+    """A sub-step under way.
+
+    Attributes:
+        qpos: float[nq], where it began.
+        qvel: float[nv], likewise.
+        warmstart: float[nv], the last acceleration of the sub-step before.
+        rate: float[nv], qvel of the stage before, with corrected rotations.
+        qacc: float[nv], acceleration of the stage before.
+        mean_rate: float[nv], the stages' weighted mean so far.
+        mean_qacc: float[nv], likewise.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    warmstart: jax.Array
+    rate: jax.Array
+    qacc: jax.Array
+    mean_rate: jax.Array
+    mean_qacc: jax.Array
+
 
 
 class MjxEngine:
@@ -66,12 +89,14 @@ class MjxEngine:
         for b in self._bodies:
             shift = shift.at[b : b + 2].set(origin)
 
-        def substep(carry: _Substep, _: None) -> tuple[_Substep, None]:
-            return self._substep(*carry, walls, action), None
+        def stage(carry: _Stage, coefficients: jax.Array) -> tuple[_Stage, None]:
+            return self._stage(carry, coefficients, walls, action), None
 
-        start: _Substep = (state.qpos - shift, state.qvel, state.carry)
-        qpos, qvel, warmstart = jax.lax.scan(substep, start, None, length=self._frame_skip)[0]
-        return PipelineState(qpos + shift, qvel, warmstart)
+        zero = jnp.zeros_like(state.qvel)
+        start = _Stage(state.qpos - shift, state.qvel, state.carry, zero, zero, zero, zero)
+        coefficients = jnp.tile(jnp.asarray(_STAGES), (self._frame_skip, 1))
+        end = jax.lax.scan(stage, start, coefficients)[0]
+        return PipelineState(end.qpos + shift, end.qvel, end.warmstart)
 
     def _near_walls(self, xy: jax.Array, origin: jax.Array) -> jax.Array:
         """Centres float[3, 3] of the boxes around ``xy[2]``, relative to ``origin[2]``; free cells' boxes are sunk."""
@@ -84,29 +109,26 @@ class MjxEngine:
         height = jnp.where(is_wall, WALL_HALF_SIZE[2], _SUNK)
         return jnp.concatenate([centre - origin + UNIT * steps, height[:, None]], axis=1)
 
-    def _substep(
-        self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, walls: jax.Array, action: jax.Array
-    ) -> _Substep:
-        """One sub-step by RK4; returns the next (qpos, qvel, warm start).
+    def _stage(self, carry: _Stage, coefficients: jax.Array, walls: jax.Array, action: jax.Array) -> _Stage:
+        """One stage of a sub-step, and the sub-step's end where it is the last one.
 
         As MuJoCo C from 4.0 on, which turns quaternions by Munthe-Kaas' method: the rotation over the step is the
         integral of the angular velocity with a correction for the change of its axis. (``mjx.step`` 3.17 has the plain
         integral, and misses C by 1e-5 to 1e-2 in a control step.)
         """
         dt = self.model.opt.timestep
+        at, share, last = coefficients
+        motion = at * dt * carry.rate
+        qvel = carry.qvel + at * dt * carry.qacc
+        qacc = self._acceleration(self._integrate(carry.qpos, motion), qvel, carry.warmstart, walls, action)
+        rate = self._correct_rotations(motion, qvel)
+        mean_rate, mean_qacc = carry.mean_rate + share * rate, carry.mean_qacc + share * qacc
 
-        def stage(carry: _Stage, coefficients: jax.Array) -> tuple[_Stage, None]:
-            rate, qacc, mean_rate, mean_qacc = carry  # rate: qvel with corrected rotations
-            at, share = coefficients
-            motion = at * dt * rate
-            stage_qvel = qvel + at * dt * qacc
-            qacc = self._acceleration(self._integrate(qpos, motion), stage_qvel, warmstart, walls, action)
-            rate = self._correct_rotations(motion, stage_qvel)
-            return (rate, qacc, mean_rate + share * rate, mean_qacc + share * qacc), None
-
+        going = _Stage(carry.qpos, carry.qvel, carry.warmstart, rate, qacc, mean_rate, mean_qacc)
         zero = jnp.zeros_like(qvel)
-        _, last_qacc, mean_rate, mean_qacc = jax.lax.scan(stage, (zero, zero, zero, zero), jnp.asarray(_STAGES))[0]
-        return self._integrate(qpos, dt * mean_rate), qvel + dt * mean_qacc, last_qacc
+        qpos = self._integrate(carry.qpos, dt * mean_rate)
+        done = _Stage(qpos, carry.qvel + dt * mean_qacc, qacc, zero, zero, zero, zero)
+        return jax.tree.map(lambda new, old: jnp.where(last > 0, new, old), done, going)
 
     def _correct_rotations(self, motion: jax.Array, qvel: jax.Array) -> jax.Array:
         """``qvel[nv]`` with each free joint's angular velocity w made the rate of the rotation vector u in ``motion``.
@@ -123,9 +145,13 @@ class MjxEngine:
     def _acceleration(
         self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, walls: jax.Array, action: jax.Array
     ) -> jax.Array:
-        data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=action, mocap_pos=walls)
+        model = self._mjx_model
+        data = self._data.replace(qpos=qpos, qvel=qvel, ctrl=action, mocap_pos=walls)
         with exact_contacts(), jax.default_matmul_precision("highest"):  # never TF32
-            return mjx.forward(self._mjx_model, data).qacc
+            for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+                data = stage(model, data)
+            efc = data._impl
+            return solve(efc.M, data.qacc_smooth, efc.efc_J, efc.efc_D, efc.efc_aref, warmstart)
 
     def _integrate(self, qpos: jax.Array, motion: jax.Array) -> jax.Array:
         """``qpos[nq]`` moved by ``motion[nv]`` (velocity times time), quaternions on their sphere."""
