@@ -56,7 +56,7 @@ class MjxEngine:
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
         """The state at (qpos[nq], qvel[nv]) without warm start."""
         qvel = jnp.asarray(qvel, jnp.float32)
-        return PipelineState(jnp.asarray(qpos, jnp.float32), qvel, jnp.zeros_like(qvel))
+        return PipelineState(jnp.asarray(qpos, jnp.float32), qvel, jnp.zeros(0), jnp.zeros_like(qvel))
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
         """One control step under ``action[nu]`` (clamped by the model's control range)."""
@@ -71,7 +71,7 @@ class MjxEngine:
 
         start: _Substep = (state.qpos - shift, state.qvel, state.carry)
         qpos, qvel, warmstart = jax.lax.scan(substep, start, None, length=self._frame_skip)[0]
-        return PipelineState(qpos + shift, qvel, warmstart)
+        return PipelineState(qpos + shift, qvel, state.sensed, warmstart)
 
     def _near_walls(self, xy: jax.Array, origin: jax.Array) -> jax.Array:
         """Centres float[3, 3] of the boxes around ``xy[2]``, relative to ``origin[2]``; free cells' boxes are sunk."""

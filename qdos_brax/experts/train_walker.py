@@ -197,9 +197,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="file for the weights (.npz), rewritten as it improves")
-    parser.add_argument(
-        "--steps", type=int, default=160_000, help="environment steps (default 160000)"
-    )
+    parser.add_argument("--steps", type=int, default=160_000, help="environment steps (default 160000)")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
