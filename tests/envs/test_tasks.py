@@ -140,12 +140,12 @@ def test_reset_takes_cells() -> None:
     env = envs.AutoReset(envs.make("antsoccer-arena", physics="mujoco"))
     keys = jax.random.split(jax.random.key(0), 50)
     cells = {"start_ij": (2, 5), "goal_ij": (3, 1), "ball_ij": (6, 6)}
-    state = jax.vmap(lambda key: env.reset(key, **cells))(keys)
+    state = jax.jit(jax.vmap(lambda key: env.reset(key, **cells)))(keys)
     for index, xy in ((0, (16, 4)), (15, (20, 20))):
         shifts = np.asarray(state.pipeline_state.qpos[:, index : index + 2]) - xy
         assert np.abs(shifts).max() <= 1.0 and shifts.std() > 0.5
     np.testing.assert_array_equal(state.info["goal_xy"], np.tile([0.0, 8.0], (50, 1)))
-    own = jax.vmap(env.reset)(keys)  # the same but for the cells
+    own = jax.jit(jax.vmap(env.reset))(keys)  # the same but for the cells
     np.testing.assert_array_equal(own.pipeline_state.qpos[:, 2:15], state.pipeline_state.qpos[:, 2:15])
     np.testing.assert_array_equal(own.info["goal_xy"][0], env.goal_xy)
     inside = jax.jit(lambda key, cell: env.reset(key, start_ij=cell).pipeline_state.qpos)(keys[0], jnp.array([2, 5]))
@@ -171,9 +171,9 @@ def test_teleporters_of_episodes_and_of_autoreset_draw_anew() -> None:
     qpos = np.asarray(env.engine.model.qpos0, np.float32)
     qpos[:2] = entrance
     keys = jax.random.split(jax.random.key(0), 60)
-    state = jax.vmap(lambda key: env.reset_to(qpos, np.zeros(14), env.goal_xy, key))(keys)
+    state = jax.jit(jax.vmap(lambda key: env.reset_to(qpos, np.zeros(14), env.goal_xy, key)))(keys)
     state.info["steps"] = state.info["steps"].at[:30].set(999)
-    after = jax.vmap(env.step)(state, jnp.zeros((60, 8)))
+    after = jax.jit(jax.vmap(env.step))(state, jnp.zeros((60, 8)))
     assert jax.tree.structure(after) == jax.tree.structure(state)
     used = [jax.random.key_data(s.info["teleport_key"]) for s in (state, after)]
     assert len(np.unique(np.concatenate(used), axis=0)) == 120
