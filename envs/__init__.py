@@ -1,13 +1,26 @@
-"""The tasks, as Brax environments on exact physics. Knows nothing of learning."""
+"""The tasks, as Brax environments on exact physics. Knows nothing of learning.
 
-import contextlib
-import io
+Names that need jax are imported on first use, so that tasks can be listed at once.
+"""
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints two lines where the optional package warp is absent
-    import mujoco.mjx  # noqa: F401
+from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from envs.families import FAMILIES, Family, TaskSpec
 from envs.registry import ALIASES, get_spec, list_tasks, make
-from envs.task import TaskEnv, TaskSpec
-from envs.wrappers import AutoReset
 
-__all__ = ["ALIASES", "AutoReset", "TaskEnv", "TaskSpec", "get_spec", "list_tasks", "make"]
+if TYPE_CHECKING:
+    from envs.task import TaskEnv
+    from envs.wrappers import AutoReset
+
+__all__ = ["ALIASES", "FAMILIES", "AutoReset", "Family", "TaskEnv", "TaskSpec", "get_spec", "list_tasks", "make"]
+
+_LOADED_LATER = {"AutoReset": "envs.wrappers", "TaskEnv": "envs.task"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LOADED_LATER:
+        raise AttributeError(f"module 'envs' has no attribute {name!r}")
+    return getattr(importlib.import_module(_LOADED_LATER[name]), name)

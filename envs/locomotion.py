@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.families import TaskSpec
 from envs.maze import get_maze
-from envs.models import ant_model
-from envs.physics import make_engine
-from envs.task import TaskEnv, TaskSpec
+from envs.models import ant_model, humanoid_model
+from envs.physics import PipelineState, Sensors, make_engine
+from envs.task import RESET_NOISE, TaskEnv
 
-Cell = tuple[int, int]
-
-# Start and goal cell of task 1 to 5 (OGBench 1.2.2).
-TASKS: dict[str, list[tuple[Cell, Cell]]] = {
-    "medium": [((1, 1), (6, 6)), ((6, 1), (1, 6)), ((5, 3), (4, 2)), ((6, 5), (6, 1)), ((2, 6), (1, 1))],
-    "large": [((1, 1), (7, 10)), ((5, 4), (7, 1)), ((7, 4), (1, 10)), ((3, 8), (5, 4)), ((1, 1), (5, 4))],
-    "giant": [((1, 1), (10, 14)), ((1, 14), (10, 1)), ((8, 14), (1, 1)), ((8, 3), (5, 12)), ((5, 9), (3, 8))],
-}
+HUMANOID_SENSORS = Sensors(
+    root="torso",
+    heights=("head",),
+    limbs=("left_hand", "left_foot", "right_hand", "right_foot"),
+    velocity="torso_subtreelinvel",
+)
+START_POSES = 4096
+"""How many joint configurations the humanoid's resets are drawn from."""
 
 
 class AntMaze(TaskEnv):
@@ -28,5 +36,61 @@ class AntMaze(TaskEnv):
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         layout = get_maze(spec.maze)
         model = ant_model(layout)
-        start, goal = TASKS[spec.maze][spec.task_id - 1]
+        start, goal = spec.cells
         super().__init__(spec, layout, make_engine(physics, model, layout), model.qpos0, (0,), (start,), goal)
+
+
+class HumanoidMaze(TaskEnv):
+    """A humanoid in a maze: qpos 28, qvel 27, action 21, observation 69, 40 control steps per second.
+
+    The observation is xy, joint angles, and what ``HUMANOID_SENSORS`` read (head height, hands and feet seen from the
+    torso, the vertical as the torso sees it, velocity of the centre of mass), then qvel.
+
+    A reset drops it 1.5 high, turned at random, with random joint angles that let no two parts touch. OGBench draws
+    angles until that is so; here the angles are one of 4,096 such draws, made once and the same for every engine.
+
+    Args:
+        spec: which task.
+        physics: "mujoco".
+    """
+
+    def __init__(self, spec: TaskSpec, physics: str) -> None:
+        layout = get_maze(spec.maze)
+        model = humanoid_model(layout)
+        start, goal = spec.cells
+        engine = make_engine(physics, model, layout, HUMANOID_SENSORS)
+        super().__init__(spec, layout, engine, model.qpos0, (0,), (start,), goal)
+        self._start_poses = _start_poses()
+
+    def observe(self, pipeline_state: PipelineState) -> jax.Array:
+        """float32[69], see above."""
+        qpos = pipeline_state.qpos
+        return jnp.concatenate([qpos[:2], qpos[7:], pipeline_state.sensed, pipeline_state.qvel])
+
+    def _start_pose(self, qpos_key: jax.Array, qvel_key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        turn_key, angles_key = jax.random.split(qpos_key)
+        quat = jax.random.uniform(turn_key, (4,))  # OGBench's: no component is ever negative
+        angles = jax.random.choice(angles_key, jnp.asarray(self._start_poses))
+        qpos = jnp.concatenate([jnp.asarray(self._init_qpos[:3]), quat / jnp.linalg.norm(quat), angles])
+        return qpos, RESET_NOISE * jax.random.normal(qvel_key, (self.engine.nv,))
+
+
+@cache
+def _start_poses() -> np.ndarray:
+    """float32[START_POSES, 21]: joint angles, uniform in their ranges, in which no two parts of the humanoid touch.
+
+    At a height of 1.5 it touches nothing else, whichever way it is turned.
+    """
+    model = humanoid_model()
+    data = mujoco.MjData(model)
+    low, high = model.jnt_range[1:].T  # without the root
+    rng = np.random.default_rng(0)
+    poses: list[np.ndarray] = []
+    while len(poses) < START_POSES:
+        angles = rng.uniform(low, high).astype(np.float32)
+        data.qpos[7:] = angles
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        if data.ncon == 0:
+            poses.append(angles)
+    return np.stack(poses)

@@ -7,6 +7,7 @@ fills its cell to a height of 2.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,6 +19,8 @@ import numpy as np
 UNIT = 4.0  # side of a cell
 OFFSET = 4.0  # cell (1, 1) is centred at the origin
 WALL_HALF_SIZE = (2.0, 2.0, 1.0)
+TELEPORT_RADIUS = 1.0  # of the discs that mark entrances and exits
+TELEPORT_REACH = 1.5
 
 _EDGE = 1e-6  # a path may run along a wall; only its interior, shrunk by this much, blocks
 _CHUNK = 1 << 22  # segments times walls looked at in one go, bounds memory
@@ -64,20 +67,45 @@ _LAYOUTS = {
         1011100010001101
         1000001000100001
         1111111111111111""",
+    "teleport": """
+        111111111111
+        100000101001
+        110100010011
+        110111000001
+        100001010101
+        101101010101
+        101101010101
+        100001000101
+        111111111111""",
 }
+
+
+@dataclass(frozen=True)
+class Teleporters:
+    """Cells whose middle sends a body to one of a few others.
+
+    Attributes:
+        entrances: cells at whose centre a body, nearer than ``TELEPORT_REACH``, is sent off.
+        exits: cells at whose centre it comes out, each as likely.
+    """
+
+    entrances: tuple[tuple[int, int], ...]
+    exits: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Maze:
-    """A layout and its geometry.
+    """A layout and its geometry. Paths and distances are those of the walls alone: none leads through a teleporter.
 
     Attributes:
-        name: "arena", "medium", "large" or "giant".
+        name: "arena", "medium", "large", "giant" or "teleport".
         grid: int[I, J], 1 where there is a wall. The outermost ring is always wall.
+        teleporters: in "teleport" only.
     """
 
     name: str
     grid: np.ndarray
+    teleporters: Teleporters | None = None
 
     @property
     def num_cells(self) -> int:
@@ -110,6 +138,26 @@ class Maze:
         columns = self.grid.shape[1]
         index = xp.asarray(index)
         return self.ij_to_xy(xp.stack([index // columns, index % columns], axis=-1))
+
+    def check_free(self, ij: np.ndarray) -> None:
+        """Raises ValueError unless ``ij`` is a free cell's (i, j)."""
+        if ij.shape != (2,) or not np.issubdtype(ij.dtype, np.integer):
+            raise ValueError(f"a cell is two whole numbers (i, j), not {ij.tolist()!r}")
+        i, j = ij.tolist()
+        rows, columns = self.grid.shape
+        if not (0 <= i < rows and 0 <= j < columns):
+            raise ValueError(f"cell ({i}, {j}) is outside the maze {self.name!r}, which has {rows} x {columns} cells")
+        if self.grid[i, j]:
+            raise ValueError(f"cell ({i}, {j}) of the maze {self.name!r} is a wall; choose one of maze.free_cells")
+
+    def teleport(self, xy: jax.Array, key: jax.Array) -> jax.Array:
+        """``xy[2]``, or where an entrance is in reach, an exit drawn from ``key``."""
+        if self.teleporters is None:
+            return xy
+        entrances = jnp.asarray(self.ij_to_xy(np.array(self.teleporters.entrances)), jnp.float32)
+        exits = jnp.asarray(self.ij_to_xy(np.array(self.teleporters.exits)), jnp.float32)
+        in_reach = (jnp.linalg.norm(xy - entrances, axis=-1) <= TELEPORT_REACH).any()
+        return jnp.where(in_reach, jax.random.choice(key, exits), xy)
 
     @cached_property
     def next_step_table(self) -> np.ndarray:
@@ -180,8 +228,8 @@ class Maze:
     def _inner_walls(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corners float[R, 2] of the rectangles that walls merge into along rows and columns.
 
-        Both directions, so that no path can slip along the seam of two touching walls. The outer ring is left out: no
-        segment between two inner points crosses it.
+        Both directions, so that no path can slip along the seam of two touching walls; a plug closes the corner at
+        which two walls touch diagonally. The outer ring is left out: no segment between two inner points crosses it.
         """
         inner = self.grid[1:-1, 1:-1]
         boxes = [(i, lo, i, hi) for i, row in enumerate(inner) for lo, hi in _runs(row)]
@@ -189,19 +237,24 @@ class Maze:
         cells = np.asarray(sorted(set(boxes)), int).reshape(-1, 4) + 1
         low = self.ij_to_xy(cells[:, :2]) - UNIT / 2 + _EDGE
         high = self.ij_to_xy(cells[:, 2:]) + UNIT / 2 - _EDGE
-        return low, high
+        plugs = self._corner_points(lambda block: block.sum() == 2 and block[0, 0] == block[1, 1])
+        return np.concatenate([low, plugs - 2 * _EDGE]), np.concatenate([high, plugs + 2 * _EDGE])
+
+    def _corner_points(self, chosen: Callable[[np.ndarray], bool]) -> np.ndarray:
+        """float[C, 2], where four cells meet whose walls (int[2, 2]) are ``chosen``."""
+        rows, columns = self.grid.shape
+        points = [
+            self.ij_to_xy(np.array([i, j])) - UNIT / 2
+            for i in range(1, rows)
+            for j in range(1, columns)
+            if chosen(self.grid[i - 1 : i + 1, j - 1 : j + 1])
+        ]
+        return np.asarray(points, np.float64).reshape(-1, 2)
 
     @cached_property
     def _corners(self) -> tuple[np.ndarray, np.ndarray]:
         """The points float[C, 2] at which shortest paths bend, and float[C, C], path lengths between them."""
-        points = []
-        for i in range(1, self.grid.shape[0]):
-            for j in range(1, self.grid.shape[1]):
-                block = self.grid[i - 1 : i + 1, j - 1 : j + 1]
-                diagonal = block.sum() == 2 and block[0, 0] == block[1, 1]
-                if block.sum() == 1 or diagonal:
-                    points.append(self.ij_to_xy(np.array([i, j])) - UNIT / 2)
-        corners = np.asarray(points, np.float64).reshape(-1, 2)
+        corners = self._corner_points(lambda block: block.sum() == 1)
         lengths = self._visible_lengths(corners, corners)
         for k in range(len(corners)):  # Floyd and Warshall
             lengths = np.minimum(lengths, lengths[:, k, None] + lengths[None, k, :])
@@ -240,6 +293,10 @@ class Maze:
         return free
 
 
+# OGBench 1.2.2's. The exit (1, 7) is a cell without a way out.
+_TELEPORTERS = {"teleport": Teleporters(entrances=((4, 6), (5, 1)), exits=((1, 7), (6, 1), (6, 10)))}
+
+
 def get_maze(name: str) -> Maze:
     """The layout called ``name``.
 
@@ -249,7 +306,7 @@ def get_maze(name: str) -> Maze:
     if name not in _LAYOUTS:
         raise ValueError(f"there is no maze {name!r}; mazes: {', '.join(_LAYOUTS)}")
     grid = np.array([[int(c) for c in row.strip()] for row in _LAYOUTS[name].split()])
-    return Maze(name, grid)
+    return Maze(name, grid, _TELEPORTERS.get(name))
 
 
 def _neighbours(i: int, j: int) -> list[tuple[int, int]]:

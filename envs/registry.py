@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from envs import locomotion, soccer
-from envs.physics import resolve_physics
-from envs.task import TaskEnv, TaskSpec
+from envs.families import FAMILIES, TaskSpec
 
-ALIASES = {"antmaze": "antmaze-large", "antsoccer": "antsoccer-arena"}
+if TYPE_CHECKING:
+    from envs.task import TaskEnv
 
-_Family = tuple[Callable[[TaskSpec, str], TaskEnv], Mapping[str, Sequence[object]]]  # class, cells of the tasks
-
-_FAMILIES: dict[str, _Family] = {
-    "antmaze": (locomotion.AntMaze, locomotion.TASKS),
-    "antsoccer": (soccer.AntSoccer, soccer.TASKS),
+ALIASES = {
+    "antmaze": "antmaze-large",
+    "antsoccer": "antsoccer-arena",
+    "humanoidmaze": "humanoidmaze-medium",
 }
-_DEFAULT_TASK = {"antmaze": 1, "antsoccer": 4}  # as OGBench's single-task mode
-_EPISODE_LENGTH = 1000
 
 
 def list_tasks() -> list[TaskSpec]:
     """Every task, family by family."""
     return [
-        TaskSpec(f"{family}-{maze}", family, maze, task_id, _EPISODE_LENGTH)
-        for family, (_, tasks) in _FAMILIES.items()
-        for maze, cells in tasks.items()
-        for task_id in range(1, len(cells) + 1)
+        TaskSpec(f"{name}-{maze}", name, maze, task_id, family.episode_lengths[maze])
+        for name, family in FAMILIES.items()
+        for maze, tasks in family.tasks.items()
+        for task_id in range(1, len(tasks) + 1)
     ]
 
 
@@ -42,12 +39,13 @@ def get_spec(name: str) -> TaskSpec:
     base, task = match.group(1, 2) if match else (name, None)
     base = ALIASES.get(base, base)
     specs = {spec.full_name: spec for spec in list_tasks()}
-    task_id = _DEFAULT_TASK.get(base.split("-")[0]) if task is None else int(task)
+    family = FAMILIES.get(base.split("-")[0])
+    task_id = int(task) if task else family and family.default_task
     full_name = f"{base}-task{task_id}"
     if full_name in specs:
         return specs[full_name]
     known = [*ALIASES, *dict.fromkeys(spec.name for spec in specs.values()), *specs]
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
+    near = max(known, key=lambda other: difflib.SequenceMatcher(None, other, name).ratio())
     raise ValueError(f"there is no task {name!r}; did you mean {near!r}? (tasks: {', '.join(known[: -len(specs)])})")
 
 
@@ -56,11 +54,16 @@ def make(name: str, physics: str = "auto") -> TaskEnv:
 
     Args:
         name: as "antmaze-large", "antmaze-large-task2" or an alias.
-        physics: "mjx", "mujoco", or "auto": MuJoCo C where jax has only a CPU, MJX on an accelerator.
+        physics: "mjx", "mujoco", or "auto": MuJoCo C where jax has only a CPU, MJX on an accelerator for the
+            tasks that run on it.
 
     Raises:
-        ValueError: unknown task or engine; the message names the choices.
+        ValueError: unknown task or engine, or an engine that the task does not run on; the message names the choices.
     """
     spec = get_spec(name)
-    env_class, _ = _FAMILIES[spec.family]
-    return env_class(spec, resolve_physics(physics))
+    family = FAMILIES[spec.family]
+    from envs.physics import resolve_physics  # here and below, for physics loads jax and MuJoCo, and listing does not
+
+    engine = resolve_physics(physics, family.engines)
+    module, _, class_name = family.env_class.partition(":")
+    return getattr(importlib.import_module(module), class_name)(spec, engine)

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax
+
+from envs.brax_base import State
+from envs.families import TaskSpec
 from envs.maze import get_maze
 from envs.models import ant_model
 from envs.physics import make_engine
-from envs.task import TaskEnv, TaskSpec
-
-Cell = tuple[int, int]
+from envs.task import TaskEnv
 
 BALL_QPOS = 15  # the ball's x; the ant's 15 come first
-
-# Start cell of the ant, start cell of the ball, goal cell of task 1 to 5 (OGBench 1.2.2).
-TASKS: dict[str, list[tuple[Cell, Cell, Cell]]] = {
-    "arena": [
-        ((1, 6), (2, 3), (5, 2)),
-        ((2, 2), (5, 5), (2, 2)),
-        ((6, 1), (2, 3), (6, 6)),
-        ((6, 6), (1, 1), (6, 1)),
-        ((4, 6), (6, 2), (1, 6)),
-    ],
-    "medium": [
-        ((1, 1), (3, 4), (6, 6)),
-        ((6, 1), (6, 5), (1, 1)),
-        ((5, 3), (4, 2), (6, 5)),
-        ((6, 5), (1, 1), (5, 3)),
-        ((1, 6), (6, 1), (1, 6)),
-    ],
-}
 
 
 class AntSoccer(TaskEnv):
@@ -41,6 +27,10 @@ class AntSoccer(TaskEnv):
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         layout = get_maze(spec.maze)
         model = ant_model(layout, ball=True)
-        ant, ball, goal = TASKS[spec.maze][spec.task_id - 1]
+        ant, ball, goal = spec.cells
         engine = make_engine(physics, model, layout)
         super().__init__(spec, layout, engine, model.qpos0, (0, BALL_QPOS), (ant, ball), goal)
+
+    def reset(self, rng: jax.Array, start_ij: Any = None, goal_ij: Any = None, ball_ij: Any = None) -> State:
+        """As ``TaskEnv.reset``; ``ball_ij`` is the cell where the ball starts, None the task's."""
+        return self._reset(rng, (start_ij, ball_ij), goal_ij)

@@ -6,7 +6,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
+
+from envs.brax_base import Env, State
 
 
 class AutoReset(Env):
@@ -46,9 +47,13 @@ class AutoReset(Env):
     def unwrapped(self) -> Env:
         return self.env.unwrapped
 
-    def reset(self, rng: jax.Array, **options: Any) -> State:
-        """The first episode's start; ``rng`` is a typed key, ``options`` are those of the task's ``reset``."""
-        return _with_nan_count(self.env.reset(rng, **options))
+    def reset(self, rng: jax.Array, **cells: Any) -> State:
+        """The first episode's start; ``rng`` is a typed key.
+
+        ``cells`` (``start_ij``, ``goal_ij``, ``ball_ij``) go to the task's reset and hold for this episode alone: those
+        that follow have the task's own cells.
+        """
+        return _with_nan_count(self.env.reset(rng, **cells))
 
     def reset_to(self, *args: Any, **kwargs: Any) -> State:
         """As the task's ``reset_to``."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -220,14 +221,22 @@ def _picture(args: argparse.Namespace) -> int:
 def _tasks(args: argparse.Namespace) -> int:
     import envs
 
-    full_names: dict[str, list[str]] = {}
-    for spec in envs.list_tasks():
-        full_names.setdefault(spec.name, []).append(f"task{spec.task_id}")
-    for name, tasks in full_names.items():
-        aliases = [alias for alias, target in envs.ALIASES.items() if target == name]
-        default = envs.get_spec(name).full_name.removeprefix(f"{name}-")
-        note = f"  (also: {', '.join(aliases)})" if aliases else ""
-        print(f"{name:24s} {tasks[0]} to {tasks[-1]}, default {default}{note}")
+    aliases = {target: alias for alias, target in envs.ALIASES.items()}
+    counts = Counter(spec.name for spec in envs.list_tasks())
+    rows = [["task", "observation", "action", "cap", "engines", "variants", "default", "alias"]]
+    for name, count in counts.items():
+        default = envs.get_spec(name)
+        family = envs.FAMILIES[default.family]
+        sizes = map(str, (family.observation_size, family.action_size, default.episode_length))
+        variants = [f"task1 to task{count}", f"task{default.task_id}", aliases.get(name, "")]
+        rows.append([name, *sizes, ", ".join(family.engines), *variants])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (
+            text.rjust(width) if column in (1, 2, 3) else text.ljust(width)  # numbers to the right
+            for column, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        print("  ".join(cells).rstrip())
     return 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import envs
 from qdos_brax import cli
 from tests.runs import toy
 
@@ -68,8 +69,12 @@ def test_flags_reach_the_configuration() -> None:
 
 def test_tasks_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("tasks", train=False) == 0
-    text = capsys.readouterr().out
-    assert "antsoccer-arena" in text and "default task4" in text and "(also: antsoccer)" in text
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert header.split() == ["task", "observation", "action", "cap", "engines", "variants", "default", "alias"]
+    rows = dict(" ".join(line.split()).split(" ", 1) for line in lines)
+    assert set(rows) == {spec.name for spec in envs.list_tasks()} and len(lines) == len(rows) == 9
+    assert rows["antsoccer-arena"] == "42 8 1000 mujoco, mjx task1 to task5 task4 antsoccer"
+    assert rows["humanoidmaze-giant"].startswith("69 21 4000 mujoco") and rows["humanoidmaze-giant"].endswith("task1")
 
 
 def test_report_draws_a_picture(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""MuJoCo models: the ant alone, in a maze, and with a ball, built as OGBench 1.2.2 builds them."""
+"""MuJoCo models: the ant alone, in a maze, and with a ball, and the humanoid, built as OGBench 1.2.2 builds them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 
 import mujoco
 
-from envs.maze import WALL_HALF_SIZE, Maze
+from envs.maze import TELEPORT_RADIUS, WALL_HALF_SIZE, Maze
 
 _ANT = Path(__file__).with_name("ant.xml")
+_HUMANOID = Path(__file__).with_name("humanoid.xml")
 
 # Collision bits of ``near_walls_model``: what the ant touches, what the ball touches, the ant against the ball.
 _ANT_BIT, _KICK_BIT, _BALL_BIT = 1, 2, 4
@@ -18,7 +19,7 @@ _ANT_BIT, _KICK_BIT, _BALL_BIT = 1, 2, 4
 def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
     """The exact model, for MuJoCo C.
 
-    Order and attributes of geoms follow OGBench (walls row by row, then the target, then the ball), for contacts are
+    Order and attributes of geoms follow OGBench (walls row by row, teleporters, the target, the ball), for contacts are
     solved in that order and the results shall agree bit for bit.
 
     Args:
@@ -31,6 +32,18 @@ def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
         _add_walls(world, maze)
     if ball:
         _add_ball(world)
+    return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+
+
+def humanoid_model(maze: Maze | None = None) -> mujoco.MjModel:
+    """The exact humanoid, for MuJoCo C; geoms in OGBench's order, as ``ant_model``.
+
+    Args:
+        maze: its walls are added; None leaves an open floor, without target.
+    """
+    root = ET.parse(_HUMANOID).getroot()
+    if maze is not None:
+        _add_walls(_find(root, "worldbody"), maze)
     return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 
@@ -99,12 +112,25 @@ def _add_walls(world: ET.Element, maze: Maze) -> None:
     floor = _find(world, "geom[@name='floor']")
     floor.set("pos", f"{2 * (columns - 3)} {2 * (rows - 3)} 0")
     floor.set("size", f"{2 * columns} {2 * rows} 0.2")
+    _add_teleporters(world, maze)
     target = {"name": "target", "type": "cylinder", "size": ".5 .05", "pos": "0 0 .05", "material": "target"}
     ET.SubElement(world, "geom", target, contype="0", conaffinity="0")
+
+
+def _add_teleporters(world: ET.Element, maze: Maze) -> None:
+    """Discs on the floor, for show: the task moves the body, not the physics."""
+    if maze.teleporters is None:
+        return
+    for kind, cells in (("in", maze.teleporters.entrances), ("out", maze.teleporters.exits)):
+        for k, cell in enumerate(cells):
+            x, y = maze.ij_to_xy(cell)
+            disc = {"name": f"teleport_{kind}_{k}", "type": "cylinder", "material": f"teleport_{kind}"}
+            place = {"pos": f"{x} {y} .05", "size": f"{TELEPORT_RADIUS} .05"}
+            ET.SubElement(world, "geom", disc | place, contype="0", conaffinity="0")
 
 
 def _find(parent: ET.Element, path: str) -> ET.Element:
     element = parent.find(path)
     if element is None:
-        raise ValueError(f"ant.xml has no element {path}")
+        raise ValueError(f"the model has no element {path}")
     return element

@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import mujoco
 
 from envs.maze import Maze
-from envs.physics.base import Engine, PipelineState
+from envs.physics.base import Engine, PipelineState, Sensors
 from envs.physics.mujoco_engine import MujocoEngine
 
-__all__ = ["Engine", "MujocoEngine", "PipelineState", "make_engine", "resolve_physics"]
+__all__ = ["Engine", "MujocoEngine", "PipelineState", "Sensors", "make_engine", "resolve_physics"]
 
 ENGINES = ("mjx", "mujoco")
 
 
-def resolve_physics(physics: str) -> str:
+def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
     """The engine's name; "auto" takes MuJoCo C where jax has only a CPU, MJX on an accelerator.
 
+    Args:
+        physics: what the user asked for.
+        supported: the engines that the task runs on; "auto" takes one of them.
+
     Raises:
-        ValueError: there is no such engine.
+        ValueError: there is no such engine, or the task does not run on it.
     """
     if physics == "auto":
-        return "mujoco" if jax.default_backend() == "cpu" else "mjx"
+        best = "mujoco" if jax.default_backend() == "cpu" else "mjx"
+        return best if best in supported else supported[0]
     if physics not in ENGINES:
         raise ValueError(f"there is no physics engine {physics!r}; choose auto, {' or '.join(ENGINES)}")
+    if physics not in supported:
+        raise ValueError(f"this task does not run on {physics!r}; choose auto or {' or '.join(supported)}")
     return physics
 
 
-def make_engine(physics: str, model: mujoco.MjModel, layout: Maze) -> Engine:
-    """The engine called ``physics`` for the whole-maze ``model`` of ``layout``."""
+def make_engine(physics: str, model: mujoco.MjModel, layout: Maze, sensors: Sensors | None = None) -> Engine:
+    """The engine called ``physics`` for the whole-maze ``model`` of ``layout``, which reads ``sensors``."""
     if resolve_physics(physics) == "mujoco":
-        return MujocoEngine(model)
+        return MujocoEngine(model, sensors=sensors)
     from envs.physics.mjx_engine import MjxEngine  # imported here, for MJX takes seconds to load
 
     return MjxEngine(layout, ball=model.nq > 15)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
 from flax import struct
 
 
@@ -14,12 +18,55 @@ class PipelineState(struct.PyTreeNode):
     Attributes:
         qpos: float32[nq], generalised positions (units: metres, radians, unit quaternions).
         qvel: float32[nv], generalised velocities.
+        sensed: float32[k], what the body observes besides qpos and qvel (``Sensors``), of this very state; k is 0 for
+            most bodies.
         carry: whatever the engine needs to go on exactly as if it had never stopped (warm start, float64 bits).
     """
 
     qpos: jax.Array
     qvel: jax.Array
+    sensed: jax.Array
     carry: Any
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What a body senses of its own posture, as DeepMind Control's humanoid does.
+
+    Attributes:
+        root: the body in whose frame the limbs are seen.
+        heights: bodies whose height above the floor is sensed.
+        limbs: bodies whose position relative to the root is sensed.
+        velocity: name of the model's sensor (size 3) of the centre of mass' velocity.
+    """
+
+    root: str
+    heights: tuple[str, ...]
+    limbs: tuple[str, ...]
+    velocity: str
+
+    @property
+    def size(self) -> int:
+        """Numbers per state: heights, limbs, the root's uprightness, the velocity."""
+        return len(self.heights) + 3 * len(self.limbs) + 6
+
+    def read(self, model: mujoco.MjModel, xpos: Any, xmat: Any, sensordata: Any) -> Any:
+        """The numbers [..., size] of states after a forward pass; NumPy in, NumPy out, jax likewise.
+
+        Args:
+            model: names bodies and sensors.
+            xpos: [..., nbody, 3], positions of the bodies.
+            xmat: [..., nbody, 3, 3], their orientations; the root's last row is the vertical as the root sees it.
+            sensordata: [..., nsensordata].
+        """
+        xp = jnp if isinstance(xpos, jax.Array) else np
+        root = model.body(self.root).id
+        heights = xpos[..., [model.body(name).id for name in self.heights], 2]
+        limbs = xpos[..., [model.body(name).id for name in self.limbs], :] - xpos[..., root, None, :]
+        in_root_frame = (limbs @ xmat[..., root, :, :]).reshape(*heights.shape[:-1], -1)
+        first = model.sensor(self.velocity).adr[0]
+        velocity = sensordata[..., first : first + 3]
+        return xp.concatenate([heights, in_root_frame, xmat[..., root, 2, :], velocity], axis=-1)
 
 
 class Engine(Protocol):
@@ -31,9 +78,12 @@ class Engine(Protocol):
     nu: int
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
-        """The state at rest in (qpos[nq], qvel[nv]), with no warm start."""
+        """The state at (qpos[nq], qvel[nv]), with no warm start."""
         ...
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
-        """One control step (``frame_skip`` sub-steps) under a constant ``action[nu]``."""
+        """One control step (``frame_skip`` sub-steps) under a constant ``action[nu]``.
+
+        Goes on from what ``state.qpos`` and ``state.qvel`` say, also where they were changed since the last step.
+        """
         ...

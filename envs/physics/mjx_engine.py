@@ -79,7 +79,7 @@ class MjxEngine:
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
         """The state at (qpos[nq], qvel[nv]) without warm start."""
         qvel = jnp.asarray(qvel, jnp.float32)
-        return PipelineState(jnp.asarray(qpos, jnp.float32), qvel, jnp.zeros_like(qvel))
+        return PipelineState(jnp.asarray(qpos, jnp.float32), qvel, jnp.zeros(0), jnp.zeros_like(qvel))
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
         """One control step under ``action[nu]`` (clamped by the model's control range)."""
@@ -96,7 +96,7 @@ class MjxEngine:
         start = _Stage(state.qpos - shift, state.qvel, state.carry, zero, zero, zero, zero)
         coefficients = jnp.tile(jnp.asarray(_STAGES), (self._frame_skip, 1))
         end = jax.lax.scan(stage, start, coefficients)[0]
-        return PipelineState(end.qpos + shift, end.qvel, end.warmstart)
+        return PipelineState(end.qpos + shift, end.qvel, state.sensed, end.warmstart)
 
     def _near_walls(self, xy: jax.Array, origin: jax.Array) -> jax.Array:
         """Centres float[3, 3] of the boxes around ``xy[2]``, relative to ``origin[2]``; free cells' boxes are sunk."""

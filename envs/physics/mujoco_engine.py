@@ -17,7 +17,9 @@ import numpy as np
 from flax import struct
 from mujoco.batch import Batch
 
-from envs.physics.base import PipelineState
+from envs.physics.base import PipelineState, Sensors
+
+_SENSED_FIELDS = ("xpos", "xmat", "sensordata")
 
 
 class MujocoCarry(struct.PyTreeNode):
@@ -39,15 +41,24 @@ class MujocoEngine:
         model: the compiled model; no activation states and no plugins (the ant and humanoid tasks have none).
         frame_skip: sub-steps per control step.
         threads: threads of the pool; None takes the cores this process may use.
+        sensors: what to read after each control step, from a forward pass of the new state; None reads nothing.
     """
 
     name = "mujoco"
 
-    def __init__(self, model: mujoco.MjModel, frame_skip: int = 5, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        frame_skip: int = 5,
+        threads: int | None = None,
+        sensors: Sensors | None = None,
+    ) -> None:
         self.model = model
         self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
         self._frame_skip = frame_skip
         self._threads = threads or len(os.sched_getaffinity(0))
+        self._sensors = sensors
+        self._nsensed = sensors.size if sensors else 0
         self._nstate = mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
         self._rest = _integration_state(model)
         self._batches: dict[int, Batch] = {}
@@ -55,17 +66,26 @@ class MujocoEngine:
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
         """The state at (qpos[nq], qvel[nv]) without warm start, as after ``mj_resetData`` and ``set_state``."""
+        qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         carry = MujocoCarry(bits=jnp.zeros(2 * self._nstate, jnp.uint32), fresh=jnp.ones((), bool))
-        return PipelineState(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32), carry)
+        if self._sensors is None:
+            return PipelineState(qpos, qvel, jnp.zeros(0), carry)
+        shape = jax.ShapeDtypeStruct((self._nsensed,), jnp.float32)
+        sensed = jax.pure_callback(self._sense_batch, shape, qpos, qvel, vmap_method="broadcast_all")
+        return PipelineState(qpos, qvel, sensed, carry)
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
-        """One control step under ``action[nu]`` (clamped by the model's control range)."""
+        """One control step under ``action[nu]`` (clamped by the model's control range).
+
+        A number of qpos or qvel that is no longer the rounding of the exact one was changed by hand, and counts.
+        """
         shapes = (
             jax.ShapeDtypeStruct((self.nq,), jnp.float32),
             jax.ShapeDtypeStruct((self.nv,), jnp.float32),
+            jax.ShapeDtypeStruct((self._nsensed,), jnp.float32),
             jax.ShapeDtypeStruct((2 * self._nstate,), jnp.uint32),
         )
-        qpos, qvel, bits = jax.pure_callback(
+        qpos, qvel, sensed, bits = jax.pure_callback(
             self._step_batch,
             shapes,
             state.qpos,
@@ -75,43 +95,72 @@ class MujocoEngine:
             jnp.asarray(action, jnp.float32),
             vmap_method="broadcast_all",
         )
-        return PipelineState(qpos, qvel, MujocoCarry(bits=bits, fresh=jnp.zeros_like(state.carry.fresh)))
+        return PipelineState(qpos, qvel, sensed, MujocoCarry(bits=bits, fresh=jnp.zeros_like(state.carry.fresh)))
 
     def exact_state(self, state: PipelineState) -> tuple[np.ndarray, np.ndarray]:
         """The float64 (qpos[..., nq], qvel[..., nv]) behind a stepped state; for parity tests, outside jit."""
         rows = np.ascontiguousarray(np.asarray(state.carry.bits)).view(np.float64)
-        return rows[..., 1 : 1 + self.nq], rows[..., 1 + self.nq : 1 + self.nq + self.nv]
+        qpos, qvel = rows[..., 1 : 1 + self.nq], rows[..., 1 + self.nq : 1 + self.nq + self.nv]
+        return _with_changes(qpos, np.asarray(state.qpos)), _with_changes(qvel, np.asarray(state.qvel))
 
     def _step_batch(
         self, qpos: jax.Array, qvel: jax.Array, bits: jax.Array, fresh: jax.Array, action: jax.Array
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, ...]:
         """The callback: NumPy only, since jax inside a callback can deadlock (jax issue 24255)."""
         lead = np.shape(fresh)
         n = int(np.prod(lead, dtype=int))
         starts = np.asarray(fresh).reshape(n)
         rows = np.ascontiguousarray(np.asarray(bits).reshape(n, -1)).view(np.float64)
+        stage = mujoco.mjtStage.mjSTAGE_NONE if self._sensors is None else mujoco.mjtStage.mjSTAGE_VEL
         with self._lock:
             batch = self._batch(n)
             np.copyto(batch.state, rows)
-            if starts.any():
-                batch.state[starts] = self._rest
-                batch.bind("qpos")[starts] = np.asarray(qpos).reshape(n, -1)[starts]
-                batch.bind("qvel")[starts] = np.asarray(qvel).reshape(n, -1)[starts]
+            batch.state[starts] = self._rest
+            for name, given in (("qpos", qpos), ("qvel", qvel)):
+                held, values = batch.bind(name), np.asarray(given).reshape(n, -1)
+                held[:] = np.where(starts[:, None], values, _with_changes(held, values))
             batch.bind("ctrl")[:] = np.asarray(action).reshape(n, -1)
-            batch.step(nstep=self._frame_skip)
+            batch.step(nstep=self._frame_skip, stage=int(stage))
             new_rows = batch.state.copy()
+            sensed = self._read_sensors(batch)
         new_qpos = new_rows[:, 1 : 1 + self.nq].astype(np.float32)
         new_qvel = new_rows[:, 1 + self.nq : 1 + self.nq + self.nv].astype(np.float32)
-        return (
-            new_qpos.reshape(*lead, -1),
-            new_qvel.reshape(*lead, -1),
-            new_rows.view(np.uint32).reshape(*lead, -1),
-        )
+        outputs = (new_qpos, new_qvel, sensed, new_rows.view(np.uint32))
+        return tuple(output.reshape(*lead, output.shape[1]) for output in outputs)
+
+    def _sense_batch(self, qpos: jax.Array, qvel: jax.Array) -> np.ndarray:
+        """The callback of ``init``: what is sensed at rest rows with (qpos, qvel)."""
+        lead = np.shape(qpos)[:-1]
+        n = int(np.prod(lead, dtype=int))
+        with self._lock:
+            batch = self._batch(n)
+            batch.state[:] = self._rest
+            batch.bind("qpos")[:] = np.asarray(qpos).reshape(n, -1)
+            batch.bind("qvel")[:] = np.asarray(qvel).reshape(n, -1)
+            batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+            return self._read_sensors(batch).reshape(*lead, self._nsensed)
+
+    def _read_sensors(self, batch: Batch) -> np.ndarray:
+        """float32[n, k] of the states that ``batch`` has just made a forward pass of."""
+        if self._sensors is None:
+            return np.zeros((batch.nsim, 0), np.float32)
+        xpos, xmat, sensordata = (batch.bind(name) for name in _SENSED_FIELDS)
+        xmat = xmat.reshape(*xpos.shape, 3)
+        return self._sensors.read(self.model, xpos, xmat, sensordata).astype(np.float32)
 
     def _batch(self, n: int) -> Batch:
         if n not in self._batches:
-            self._batches[n] = Batch(self.model, nsim=n, nthread=min(self._threads, n))
+            batch = Batch(self.model, nsim=n, nthread=min(self._threads, n))
+            if self._sensors is not None:
+                for name in _SENSED_FIELDS:  # a field is filled from the first call after it was bound
+                    batch.bind(name)
+            self._batches[n] = batch
         return self._batches[n]
+
+
+def _with_changes(exact: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """``exact`` (float64), but ``values`` (float32) where they are not its rounding."""
+    return np.where(exact.astype(np.float32) == values, exact, values)
 
 
 def _integration_state(model: mujoco.MjModel) -> np.ndarray:

@@ -43,8 +43,9 @@ def default_dataset(
         num_envs: environments stepped at once.
 
     Raises:
-        UserError: a parameter is out of range, or the folder cannot be written.
+        UserError: a parameter is out of range, no expert is shipped for the body, or the folder cannot be written.
     """
+    collect.check_expert(env)
     policy = walker.load()
     parameters = f"n{transitions}-bad{degraded_share:g}-noise{noise:g}-seed{seed}-envs{num_envs}"
     version = f"{env.backend}-v{collect.RECIPE}-{_digest(policy.params)}"

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +30,8 @@ from qdos_brax.experts.steering import Navigator, dribble_cost, dribble_directio
 RECIPE = 3
 """Version of what is collected; part of the cache's file names."""
 
+_WALKER_FAMILIES = ("antmaze", "antsoccer")  # the shipped walker is an ant
+
 HEAVY_NOISE = 1.0  # standard deviation of action noise in noisy episodes
 WANDER_STEPS = 30  # mean steps between two draws of a wanderer's direction
 CHUNK_STEPS = 50  # steps per call of the jitted program; the episode length is a multiple of it
@@ -47,11 +48,16 @@ NEAR_GOAL = 4.5  # m, from the goal's cell to its neighbours
 PATIENCE = 200  # steps after which a failing attempt turns round in any case
 
 
+Row = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+"""qpos, qvel, observation and action of a step, all before it."""
+
+
 class Lane(struct.PyTreeNode):
     """One environment while collecting. The cargo is what has to reach the goal: the ant, or in soccer the ball.
 
     Attributes:
         pipeline: the simulator's state.
+        observation: float32[obs], what the task shows of it.
         goal_xy, origin_xy: float32[2], where the cargo goes, and where it was when that goal was drawn.
         turned: bool, a failing attempt that is on its way back to the origin.
         attempt: int32, steps since the goal was drawn or the attempt turned.
@@ -61,6 +67,7 @@ class Lane(struct.PyTreeNode):
     """
 
     pipeline: PipelineState
+    observation: jax.Array
     goal_xy: jax.Array
     origin_xy: jax.Array
     turned: jax.Array
@@ -100,8 +107,9 @@ def collect(
         terminal: episodes go on after a success and end by time.
 
     Raises:
-        UserError: an argument out of range.
+        UserError: an argument out of range, or a body that no expert is shipped for.
     """
+    check_expert(env)
     if transitions < SHORTEST_EPISODE:
         raise UserError(f"transitions must be at least {SHORTEST_EPISODE} (one episode), got {transitions}")
     if not 0.0 <= degraded_share <= 1.0:
@@ -126,6 +134,15 @@ def collect(
     rows["rewards"] = success.astype(np.float32) - 1.0
     rows["terminals"] = np.zeros(transitions, bool)
     return rows
+
+
+def check_expert(env: TaskEnv) -> None:
+    """Raises UserError unless an expert is shipped that moves the task's body."""
+    if env.spec.family not in _WALKER_FAMILIES:
+        raise UserError(
+            f"no expert is shipped for {env.spec.family}, so no data can be collected; "
+            f"train with --dataset FILE, such as OGBench's {env.spec.name}-navigate-v0.npz"
+        )
 
 
 def data_name(env: TaskEnv) -> str:
@@ -161,8 +178,8 @@ class Collector:
             chunks.append(jax.device_get(rows))
             if progress is not None:
                 progress((index + 1) * CHUNK_STEPS * n)
-        qpos, qvel, actions = (np.concatenate(part, axis=1) for part in zip(*chunks, strict=True))
-        observations, after = self._observe(qpos, qvel), self._observe(lanes.pipeline.qpos, lanes.pipeline.qvel)
+        qpos, qvel, observations, actions = (np.concatenate(part, axis=1) for part in zip(*chunks, strict=True))
+        after = np.asarray(lanes.observation)
         ends = np.zeros((n, length), bool)
         ends[:, -1] = True
         rows = {
@@ -176,23 +193,15 @@ class Collector:
         }
         return {name: value.reshape(n * length, *value.shape[2:]) for name, value in rows.items()}
 
-    def _observe(self, qpos: Any, qvel: Any) -> np.ndarray:
-        flat = jax.jit(jax.vmap(lambda q, v: self.env.reset_to(q, v).obs))(
-            np.reshape(qpos, (-1, self.env.engine.nq)), np.reshape(qvel, (-1, self.env.engine.nv))
-        )
-        return np.asarray(flat).reshape(*np.shape(qpos)[:-1], -1)
-
     @partial(jax.jit, static_argnums=0)
     def _reset(self, keys: jax.Array) -> Lane:
         return jax.vmap(self._reset_lane)(keys)
 
     @partial(jax.jit, static_argnums=0)
-    def _chunk(
-        self, lanes: Lane, kinds: jax.Array, keys: jax.Array
-    ) -> tuple[Lane, tuple[jax.Array, jax.Array, jax.Array]]:
-        """CHUNK_STEPS steps of every lane; rows (qpos, qvel, action) as [L, CHUNK_STEPS, ...]."""
+    def _chunk(self, lanes: Lane, kinds: jax.Array, keys: jax.Array) -> tuple[Lane, Row]:
+        """CHUNK_STEPS steps of every lane; rows as [L, CHUNK_STEPS, ...]."""
 
-        def step(lanes: Lane, keys: jax.Array) -> tuple[Lane, tuple[jax.Array, jax.Array, jax.Array]]:
+        def step(lanes: Lane, keys: jax.Array) -> tuple[Lane, Row]:
             return jax.vmap(self._step_lane)(lanes, kinds, keys)
 
         by_step = jax.vmap(lambda key: jax.random.split(key, CHUNK_STEPS), out_axes=1)(keys)
@@ -207,8 +216,10 @@ class Collector:
         if self.has_ball:
             qpos = qpos.at[BALL_QPOS : BALL_QPOS + 2].set(self._ball_xy(ball_key))
         ant, cargo = self._positions(qpos)
+        pipeline = self.env.engine.init(qpos, start.qvel)
         return Lane(
-            pipeline=self.env.engine.init(qpos, start.qvel),
+            pipeline=pipeline,
+            observation=self.env.observe(pipeline),
             goal_xy=self._goal_xy(goal_key, ant, cargo),
             origin_xy=cargo,
             turned=jnp.zeros((), bool),
@@ -250,22 +261,23 @@ class Collector:
         cargo = BALL_QPOS if self.has_ball else 0
         return qpos[:2], qpos[cargo : cargo + 2]
 
-    def _step_lane(
-        self, lane: Lane, kind: jax.Array, key: jax.Array
-    ) -> tuple[Lane, tuple[jax.Array, jax.Array, jax.Array]]:
-        plan_key, noise_key = jax.random.split(key)
+    def _step_lane(self, lane: Lane, kind: jax.Array, key: jax.Array) -> tuple[Lane, Row]:
+        plan_key, noise_key, teleport_key = jax.random.split(key, 3)
         lane = self._plan(lane, kind, plan_key)
         qpos, qvel = lane.pipeline.qpos, lane.pipeline.qvel
         action = self.policy.act(qpos, qvel, self._direction(lane, kind))
         sigma = jnp.where(kind == QUALITY["noisy"], HEAVY_NOISE, self.noise)
         action = jnp.clip(action + sigma * jax.random.normal(noise_key, action.shape), -1.0, 1.0)
+        row = (qpos, qvel, lane.observation, action)
+        pipeline = self.env.engine.step(lane.pipeline, action)
         lane = lane.replace(
-            pipeline=self.env.engine.step(lane.pipeline, action),
+            pipeline=self.env.teleport(pipeline, teleport_key),
+            observation=self.env.observe(pipeline),  # still at the entrance, as the task's own step shows it
             attempt=lane.attempt + 1,
             clock=lane.clock + 1,
             escape=jnp.maximum(lane.escape - 1, 0),
         )
-        return lane, (qpos, qvel, action)
+        return lane, row
 
     def _plan(self, lane: Lane, kind: jax.Array, key: jax.Array) -> Lane:
         """Turns a failing attempt, draws a new goal on arrival or when stuck, sends a stuck ant elsewhere."""

@@ -20,7 +20,8 @@ def progress(env: Any, dataset: Dataset, starts: np.ndarray, horizon: int) -> np
     """float64[S], distance left at s_0 minus distance left at s_H, of the segments that begin at ``starts``.
 
     ``env.true_distance`` is the shortest path to the task's goal (soccer: agent to ball plus ball to goal). Positions
-    are stored before the action, so a segment that ends its episode is measured at s_{H-1}, one step short.
+    are stored before the action, so a segment that ends its episode is measured at s_{H-1}, one step short. A
+    teleporter may lose a segment infinitely much, by an exit without a way out.
 
     Raises:
         ValueError: the dataset has no qpos.
@@ -29,7 +30,10 @@ def progress(env: Any, dataset: Dataset, starts: np.ndarray, horizon: int) -> np
         raise ValueError(f"{dataset.source}: progress needs the simulator's qpos")
     distance = np.asarray(env.true_distance(dataset.qpos), np.float64)
     last = np.asarray(starts) + horizon - 1
-    return distance[starts] - distance[np.where(dataset.ends[last], last, np.minimum(last + 1, dataset.size - 1))]
+    before = distance[starts]
+    after = distance[np.where(dataset.ends[last], last, np.minimum(last + 1, dataset.size - 1))]
+    cut_off = np.isinf(before) & np.isinf(after)  # no way before, no way after: nothing gained or lost
+    return np.where(cut_off, 0.0, before - np.where(cut_off, 0.0, after))
 
 
 def auc(scores: np.ndarray, positive: np.ndarray) -> float:

@@ -34,7 +34,9 @@ class Navigator:
         self.next_cell = jnp.asarray(maze.next_step_table)  # int32[C, C], the neighbour to enter, from row to column
         self.sight_cell = jnp.asarray(_farthest_in_sight(maze))  # int32[C, C], the last cell a straight walk reaches
         self._free = jnp.asarray(maze.grid.reshape(-1) == 0)
-        self.free_xy = jnp.asarray(maze.ij_to_xy(maze.free_cells), jnp.float32)  # float32[F, 2]
+        indices = maze.cell_index(maze.ij_to_xy(maze.free_cells))
+        leads_on = (maze.next_step_table[indices] != indices[:, None]).any(axis=1)  # not walled in on all sides
+        self.free_xy = jnp.asarray(maze.ij_to_xy(maze.free_cells[leads_on]), jnp.float32)  # float32[F, 2]
 
     def cell(self, xy: jax.Array) -> jax.Array:
         """int32[...], the index of the cell that holds ``xy[..., 2]``."""
@@ -118,6 +120,8 @@ def _farthest_in_sight(maze: Maze) -> np.ndarray:
         reachable = {goal: _is_free_corridor(maze, start, goal) for goal in free}
         for goal in free:
             cell = farthest = maze.next_step_table[start, goal]
+            if cell == start:  # it is the goal, or cut off from it
+                continue
             while cell != goal and reachable[cell := maze.next_step_table[cell, goal]]:
                 farthest = cell
             table[start, goal] = farthest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -37,16 +38,18 @@ class PhysicsRollout:
     def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
         """Normalised observations[B, H, obs] before each action of the rollouts."""
 
-        def one(qpos: jax.Array, qvel: jax.Array, skill: jax.Array) -> jax.Array:
+        def one(qpos: jax.Array, qvel: jax.Array, key: jax.Array, skill: jax.Array) -> jax.Array:
             def step(state: State, _: None) -> tuple[State, jax.Array]:
                 observation = self._normalise(state.obs)
                 return self._env.step(state, self._model.act(params, observation, skill)), observation
 
-            start = self._env.reset_to(qpos, qvel, self._env.goal_xy)
+            start = self._env.reset_to(qpos, qvel, self._env.goal_xy, key)
             return jax.lax.scan(step, start, None, length=self._horizon)[1]
 
         assert data.qpos is not None and data.qvel is not None  # refused in __init__
-        return jax.vmap(one)(data.qpos[starts], data.qvel[starts], latent)
+        # A maze with teleporters draws exits from the key: every logged state has its own, the same for all skills.
+        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(starts)
+        return jax.vmap(one)(data.qpos[starts], data.qvel[starts], keys, latent)
 
 
 class LoggedStates:

@@ -77,6 +77,38 @@ def test_one_seed_repeats_and_two_differ(env: envs.TaskEnv, rows: dict[str, np.n
     assert not np.array_equal(other["infos/qpos"][0], rows["infos/qpos"][0])
 
 
+def test_teleporters_work_while_collecting() -> None:
+    env = envs.make("antmaze-teleport", physics="mujoco")
+    exits = env.layout.ij_to_xy(np.array(env.layout.teleporters.exits))
+
+    class AtEntrances(collect.Collector):
+        """Every lane starts at an entrance, so that the first step goes through it."""
+
+        def _start_xy(self, key: jax.Array) -> jax.Array:
+            entrances = self.env.layout.ij_to_xy(np.array(self.env.layout.teleporters.entrances))
+            return jax.random.choice(key, jnp.asarray(entrances, jnp.float32))
+
+    kinds = np.full(12, QUALITY["wander"], np.int8)
+    rows = AtEntrances(env, StandIn(), 0.2).episodes(jax.random.key(0), kinds, collect.CHUNK_STEPS)
+    first = np.arange(12) * collect.CHUNK_STEPS
+    came_out = rows["infos/qpos"][first + 1, :2]
+    assert {tuple(xy) for xy in came_out} == {tuple(xy) for xy in exits}
+    # as online: the observation shows the entrance once more, the one after it the exit
+    np.testing.assert_array_equal(rows["next_observations"][first], rows["observations"][first + 1])
+    assert (np.linalg.norm(rows["observations"][first + 1, :2] - rows["observations"][first, :2], axis=1) < 1).all()
+    assert (np.linalg.norm(rows["observations"][first + 2, :2] - came_out, axis=1) < 1).all()
+
+
+def test_a_body_without_an_expert_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = envs.make("humanoidmaze", physics="mujoco")
+    monkeypatch.setenv("QDOS_DATA", str(tmp_path))
+    parameters: dict[str, Any] = {"transitions": 400, "degraded_share": 0.5, "noise": 0.2, "seed": 0}
+    for make in (collect.collect, cache.default_dataset):
+        with pytest.raises(UserError, match=r"no expert .* humanoidmaze.*--dataset FILE.*humanoidmaze-medium-navigate"):
+            make(env, **parameters)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_the_share_of_degraded_episodes_is_as_stated(share: float) -> None:
     kinds = collect._episode_kinds(100, share, seed=0)

@@ -26,14 +26,15 @@ def ogbench_rows(env: envs.TaskEnv, lengths: tuple[int, ...] = (7, 5, 9), seed: 
     """Rows as OGBench's generator stores them: T + 1 per trajectory, some at the task's goal."""
     rng = np.random.default_rng(seed)
     n = sum(lengths)
-    qpos, qvel = rng.normal(size=(n, 15)).astype(np.float32), rng.normal(size=(n, 14)).astype(np.float32)
+    nq, nv, other = env.engine.nq, env.engine.nv, env.observation_size - env.engine.nq - env.engine.nv
+    qpos, qvel = rng.normal(size=(n, nq)).astype(np.float32), rng.normal(size=(n, nv)).astype(np.float32)
     at_goal = rng.random(n) < 0.3
     qpos[at_goal, :2] = env.goal_xy + rng.normal(size=(at_goal.sum(), 2)) * 0.3
     terminals = np.zeros(n, bool)
     terminals[np.cumsum(lengths) - 1] = True
     return {
-        "observations": np.concatenate([qpos, qvel], axis=1),
-        "actions": rng.uniform(-1, 1, (n, 8)).astype(np.float32),
+        "observations": np.concatenate([qpos, qvel, rng.normal(size=(n, other)).astype(np.float32)], axis=1),
+        "actions": rng.uniform(-1, 1, (n, env.action_size)).astype(np.float32),
         "terminals": terminals,
         "qpos": qpos,
         "qvel": qvel,
@@ -57,11 +58,13 @@ def d4rl_rows(env: envs.TaskEnv) -> dict[str, np.ndarray]:
     }
 
 
-def test_npz_equals_ogbench_reader_and_relabelling(tmp_path: Path, env: envs.TaskEnv) -> None:
+@pytest.mark.parametrize("name", ["antmaze-medium", "antmaze-teleport", "humanoidmaze-medium"])
+def test_npz_equals_ogbench_reader_and_relabelling(tmp_path: Path, name: str) -> None:
+    env = envs.make(f"{name}-task1", physics="mujoco")
     path = tmp_path / "set.npz"
     np.savez(path, **ogbench_rows(env))
     reference = load_dataset(str(path), add_info=True)
-    relabel_dataset("antmaze-medium-singletask", gymnasium.make("antmaze-medium-singletask-task1-v0"), reference)
+    relabel_dataset(f"{name}-singletask", gymnasium.make(f"{name}-singletask-task1-v0"), reference)
 
     dataset = formats.read(path, env)
 

@@ -33,6 +33,17 @@ def test_progress_is_the_distance_gained_and_stays_in_the_episode() -> None:
     np.testing.assert_allclose(gains, [5.0, 3.0, 20.0, 10.0])
 
 
+def test_progress_where_there_is_no_way() -> None:
+    qpos = np.array([[9.0], [np.inf], [np.inf], [np.inf]], np.float32)  # a teleporter's exit without a way out
+    blank = np.zeros((4, 1), np.float32)
+    dataset = Dataset(blank, blank, blank[:, 0], blank[:, 0], np.zeros(4, bool), blank, qpos=qpos, source="toy")
+    env = SimpleNamespace(true_distance=lambda q: q[:, 0])
+    gains = quality.progress(env, dataset, np.array([0, 1]), 2)
+    np.testing.assert_array_equal(gains, [-np.inf, 0.0])
+    numbers = quality.report(np.array([0.0, 1.0]), np.ones(2), gains)
+    assert numbers["losing_share"] == 0.5 and numbers["gaining_share"] == 0.0
+
+
 def test_report_by_hand() -> None:
     gains = np.array([3.0, 2.0, -2.0, 0.0])
     numbers = quality.report(

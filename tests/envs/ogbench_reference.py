@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import cache
 from typing import Any
 
 import gymnasium
@@ -24,13 +25,15 @@ def ogbench_env(name: str) -> gymnasium.Env:
 def ogbench_rollout(
     env: gymnasium.Env, qpos: np.ndarray, qvel: np.ndarray, actions: np.ndarray, steps_done: int = 0
 ) -> dict[str, np.ndarray]:
-    """OGBench's environment from (qpos, qvel) under ``actions[T, 8]``; everything stacked over time, in float64.
+    """OGBench's environment from (qpos, qvel) under ``actions[T, nu]``; everything stacked over time, in float64.
+
+    ``state`` is the simulator's [nq + nv] after the step, with what a teleporter did.
 
     Args:
         env: from ``ogbench_env``.
         qpos: [nq].
         qvel: [nv].
-        actions: [T, 8].
+        actions: [T, nu].
         steps_done: how much of the episode's cap is used up.
     """
     env.reset()
@@ -39,23 +42,36 @@ def ogbench_rollout(
     while not isinstance(limit, gymnasium.wrappers.TimeLimit):
         limit = limit.env
     limit._elapsed_steps = steps_done
-    rows: dict[str, list[Any]] = {"obs": [], "reward": [], "success": [], "terminated": [], "truncated": []}
+    rows: dict[str, list[Any]] = {
+        "obs": [],
+        "state": [],
+        "reward": [],
+        "success": [],
+        "terminated": [],
+        "truncated": [],
+    }
+    data = env.unwrapped.data
     for action in actions:
         obs, reward, terminated, truncated, info = env.step(action)
-        values = (obs, reward, info["success"], terminated, truncated)
+        state = np.concatenate([data.qpos, data.qvel])
+        values = (obs, state, reward, info["success"], terminated, truncated)
         for key, value in zip(rows, values, strict=True):
             rows[key].append(value)
     return {key: np.asarray(value) for key, value in rows.items()}
 
 
 def our_rollout(env: TaskEnv, state: Any, actions: np.ndarray) -> Any:
-    """States stacked over time, from ``state`` under ``actions[T, 8]`` (one environment, jitted)."""
+    """States stacked over time, from ``state`` under ``actions[T, nu]`` (one environment, jitted once per ``env``)."""
+    return _rollout_program(env)(state, actions)
 
+
+@cache
+def _rollout_program(env: TaskEnv) -> Any:
     def body(carry: Any, action: jax.Array) -> tuple[Any, Any]:
         after = env.step(carry, action)
         return after, after
 
-    return jax.jit(lambda s, a: jax.lax.scan(body, s, a)[1])(state, actions)
+    return jax.jit(lambda state, actions: jax.lax.scan(body, state, actions)[1])
 
 
 def start_state(env: TaskEnv, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from envs.maze import Maze, get_maze
 from tests.envs.ogbench_reference import ogbench_env
 
 
-@pytest.mark.parametrize("name", ["medium", "giant"])
+@pytest.mark.parametrize("name", ["medium", "giant", "teleport"])
 def test_next_step_table_equals_ogbench(name: str) -> None:
     maze = get_maze(name)
     reference = ogbench_env(f"antmaze-{name}-task1").unwrapped
@@ -74,8 +74,28 @@ def test_distance_never_passes_between_touching_walls() -> None:
     # two walls that touch only at a corner close the way: from (1,1) to (2,2) around is impossible
     grid = np.array([[1, 1, 1, 1], [1, 0, 1, 1], [1, 1, 0, 1], [1, 1, 1, 1]])
     maze = Maze("toy", grid)
-    corner = maze.distance(np.array([0.0, 0.0]), np.array([4.0, 4.0]))
-    assert corner == pytest.approx(np.hypot(4, 4)) or np.isinf(corner)
+    assert np.isinf(maze.distance(np.array([0.0, 0.0]), np.array([4.0, 4.0])))
+    assert np.isinf(maze.distance(np.array([1.9, 1.0]), np.array([2.5, 3.9])))
+    # medium has such a corner between (4, 2) and (5, 3): the way leads round three corners of the wall (5, 2)
+    medium = get_maze("medium")
+    around = medium.distance(medium.ij_to_xy((4, 2)), medium.ij_to_xy((5, 3)))
+    assert around == pytest.approx(2 * np.hypot(2, 2) + 4 + 4)
+
+
+def test_teleporters() -> None:
+    maze = get_maze("teleport")
+    send = jax.jit(jax.vmap(maze.teleport))
+    entrances = maze.ij_to_xy(np.array(maze.teleporters.entrances))
+    exits = maze.ij_to_xy(np.array(maze.teleporters.exits))
+    keys = jax.random.split(jax.random.key(0), 3000)
+    out = np.asarray(send(jnp.tile(jnp.asarray(entrances[1] + np.array([1.0, 1.0]), jnp.float32), (3000, 1)), keys))
+    shares = [(out == xy).all(axis=1).mean() for xy in exits]
+    np.testing.assert_allclose(shares, 1 / 3, atol=0.04)
+    outside = jnp.asarray(entrances + np.array([1.51, 0.0]), jnp.float32)
+    np.testing.assert_array_equal(send(outside, keys[:2]), outside)
+    # walls alone make distances: the corridor through the entrance (4, 6) is as long as it looks, the exit is a trap
+    through = maze.distance(maze.ij_to_xy((6, 6)), maze.ij_to_xy((3, 6)))
+    assert through == pytest.approx(12.0) and np.isinf(maze.distance(exits[0], exits[1]))
 
 
 def test_unknown_maze_is_named() -> None:

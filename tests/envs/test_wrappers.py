@@ -22,11 +22,11 @@ class Slider:
     nq = nv = nu = 2
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
-        return PipelineState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros(()))
+        return PipelineState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros(0), jnp.zeros(()))
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
         qpos = jnp.where(action[0] > 8, jnp.nan, state.qpos + action)
-        return PipelineState(qpos, action, state.carry + 1)
+        return PipelineState(qpos, action, state.sensed, state.carry + 1)
 
 
 def toy(cap: int = 3) -> envs.AutoReset:
