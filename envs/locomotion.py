@@ -9,57 +9,58 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from envs.bodies import ANT, HUMANOID, Body
 from envs.families import TaskSpec
 from envs.maze import get_maze
-from envs.models import ant_model, humanoid_model
-from envs.physics import PipelineState, Sensors, make_engine
+from envs.models import humanoid_model
+from envs.physics import PipelineState
 from envs.task import RESET_NOISE, TaskEnv
 
-HUMANOID_SENSORS = Sensors(
-    root="torso",
-    heights=("head",),
-    limbs=("left_hand", "left_foot", "right_hand", "right_foot"),
-    velocity="torso_subtreelinvel",
-)
 START_POSES = 4096
 """How many joint configurations the humanoid's resets are drawn from."""
 
 
-class AntMaze(TaskEnv):
-    """An ant in a maze: qpos 15, qvel 14, action 8, observation 29, 10 control steps per second.
+class BodyEnv(TaskEnv):
+    """A task of one of ``envs.bodies``; subclasses say which.
 
     Args:
         spec: which task.
         physics: "mjx" or "mujoco".
     """
 
+    body: Body
+
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         layout = get_maze(spec.maze)
-        model = ant_model(layout)
-        start, goal = spec.cells
-        super().__init__(spec, layout, make_engine(physics, model, layout), model.qpos0, (0,), (start,), goal)
+        engine = self.body.engine(physics, layout)
+        *starts, goal = spec.cells
+        super().__init__(spec, layout, engine, engine.model.qpos0, self.body.places, starts, goal)
+
+    def whole_model(self) -> mujoco.MjModel:
+        """A fresh model with all walls and the target, as OGBench has it; the engines' own have the near walls only."""
+        return self.body.whole(self.layout)
 
 
-class HumanoidMaze(TaskEnv):
+class AntMaze(BodyEnv):
+    """An ant in a maze: qpos 15, qvel 14, action 8, observation 29, 10 control steps per second."""
+
+    body = ANT
+
+
+class HumanoidMaze(BodyEnv):
     """A humanoid in a maze: qpos 28, qvel 27, action 21, observation 69, 40 control steps per second.
 
-    The observation is xy, joint angles, and what ``HUMANOID_SENSORS`` read (head height, hands and feet seen from the
-    torso, the vertical as the torso sees it, velocity of the centre of mass), then qvel.
+    The observation is xy, joint angles, and what ``envs.bodies.HUMANOID`` senses (head height, hands and feet
+    seen from the torso, the vertical as the torso sees it, velocity of the centre of mass), then qvel.
 
     A reset drops it 1.5 high, turned at random, with random joint angles that let no two parts touch. OGBench draws
     angles until that is so; here the angles are one of 4,096 such draws, made once and the same for every engine.
-
-    Args:
-        spec: which task.
-        physics: "mujoco".
     """
 
+    body = HUMANOID
+
     def __init__(self, spec: TaskSpec, physics: str) -> None:
-        layout = get_maze(spec.maze)
-        model = humanoid_model(layout)
-        start, goal = spec.cells
-        engine = make_engine(physics, model, layout, HUMANOID_SENSORS)
-        super().__init__(spec, layout, engine, model.qpos0, (0,), (start,), goal)
+        super().__init__(spec, physics)
         self._start_poses = _start_poses()
 
     def observe(self, pipeline_state: PipelineState) -> jax.Array:

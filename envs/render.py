@@ -21,10 +21,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from envs.locomotion import BodyEnv
 from envs.maze import UNIT, WALL_HALF_SIZE, Maze
-from envs.physics import MujocoEngine
-from envs.registry import make
-from envs.task import TaskEnv
 
 CAMERAS = ("top", "follow")
 
@@ -63,7 +61,7 @@ class Renderer:
         NoOpenGL: this machine cannot draw.
     """
 
-    def __init__(self, env: TaskEnv, height: int = 480, width: int | None = None, camera: str = "top") -> None:
+    def __init__(self, env: BodyEnv, height: int = 480, width: int | None = None, camera: str = "top") -> None:
         if camera not in CAMERAS:
             raise ValueError(f"there is no camera {camera!r}; cameras: {', '.join(CAMERAS)}")
         if width is None:
@@ -71,9 +69,7 @@ class Renderer:
             width = 16 * round(height * columns / rows / 16)
         if height < 1 or width < 1:
             raise ValueError(f"a frame of {height} x {width} has no pixels; height and width start at 1")
-        engine = make(env.spec.full_name, physics="mujoco").engine
-        assert isinstance(engine, MujocoEngine)
-        self._model = engine.model  # of its own, for it is changed below and in every frame
+        self._model = env.whole_model()  # of its own, for it is changed below and in every frame
         self._model.vis.global_.offheight = height
         self._model.vis.global_.offwidth = width
         self._data = mujoco.MjData(self._model)
@@ -119,7 +115,7 @@ class Renderer:
 
 def steps_per_second(env: Any) -> float:
     """Control steps per simulated second: the frame rate at which a film of every step runs in real time."""
-    return 1.0 / (env.engine._frame_skip * env.engine.model.opt.timestep)
+    return 1.0 / (env.engine.frame_skip * env.engine.model.opt.timestep)
 
 
 def _top_camera(layout: Maze, fovy: float, aspect: float) -> mujoco.MjvCamera:

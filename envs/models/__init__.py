@@ -6,18 +6,23 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from envs.maze import TELEPORT_RADIUS, WALL_HALF_SIZE, Maze
+from envs.physics.walls import WALLS, WALLS_AROUND
 
 _ANT = Path(__file__).with_name("ant.xml")
 _HUMANOID = Path(__file__).with_name("humanoid.xml")
 
-# Collision bits of ``near_walls_model``: what the ant touches, what the ball touches, the ant against the ball.
-_ANT_BIT, _KICK_BIT, _BALL_BIT = 1, 2, 4
+# Collision bits of the models for MJX: what ant or humanoid touch, the ant against the ball, what the ball touches.
+_BODY_BIT, _KICK_BIT, _BALL_BIT = 1, 2, 4
+
+_BOUNDLESS = 1e6
+_MAX_CONTACTS = 12  # per contact dimension; benchmarks/exactness.py counts what that drops
 
 
 def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
-    """The exact model, for MuJoCo C.
+    """The model with all walls.
 
     Order and attributes of geoms follow OGBench (walls row by row, teleporters, the target, the ball), for contacts are
     solved in that order and the results shall agree bit for bit.
@@ -36,7 +41,7 @@ def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
 
 
 def humanoid_model(maze: Maze | None = None) -> mujoco.MjModel:
-    """The exact humanoid, for MuJoCo C; geoms in OGBench's order, as ``ant_model``.
+    """The humanoid with all walls; geoms in OGBench's order, as ``ant_model``.
 
     Args:
         maze: its walls are added; None leaves an open floor, without target.
@@ -47,39 +52,86 @@ def humanoid_model(maze: Maze | None = None) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 
-def near_walls_model(ball: bool = False) -> mujoco.MjModel:
-    """The model for MJX: open floor, and three mocap boxes per free body for the walls that can be in reach.
+def near_walls_ant(mocap: bool, ball: bool = False) -> mujoco.MjModel:
+    """The ant on an open floor, with the walls that can be in reach: ``WALLS`` boxes per free body, to be moved there.
 
-    Mocap bodies come in this order: the ant's three, the ball's three. Differences from ``ant_model``:
-
-    - Only moving geoms have ``contype``: MJX collides the floor with mocap boxes, which C filters as static.
-    - A body touches its own boxes only (collision bits below).
-    - At most 12 contacts per dimension, the deepest; 8 solver and 12 line-search iterations. MJX finds a numeric's
-      value by index, not by address, so that this one has to come before any longer one.
+    Args:
+        mocap: the boxes are mocap bodies ("ant_wall_0", .., "ball_wall_0", ..), for MJX; else geoms of the world
+            ("wall_0", ..), for MuJoCo C. See ``_compile_for_mjx`` and ``_compile_for_c``.
+        ball: with the soccer ball.
     """
     root = ET.parse(_ANT).getroot()
-    custom = ET.SubElement(root, "custom")
-    ET.SubElement(custom, "numeric", name="max_contact_points", data="12")
-    option = _find(root, "option")
-    option.set("iterations", "8")
-    option.set("ls_iterations", "12")
     world = _find(root, "worldbody")
+    if not mocap:
+        _add_world_walls(world, bodies=1 + ball)
+        if ball:
+            _add_ball(world)
+        return _compile_for_c(root)
+
     for geom in _find(world, "body[@name='torso']").iter("geom"):
-        geom.set("contype", str(_ANT_BIT | _KICK_BIT))
+        geom.set("contype", str(_BODY_BIT | _KICK_BIT))
         geom.set("conaffinity", "0")
-    floor = _find(world, "geom[@name='floor']")
-    floor.set("contype", "0")
-    floor.set("conaffinity", str(_ANT_BIT | _BALL_BIT))
+    _add_mocap_walls(world, "ant", _BODY_BIT)
     if ball:
         geom = _add_ball(world)
         geom.set("contype", str(_BALL_BIT))
         geom.set("conaffinity", str(_KICK_BIT))
-    for owner, bit in (("ant", _ANT_BIT), ("ball", _BALL_BIT))[: 2 if ball else 1]:
-        for k in range(3):
-            box = ET.SubElement(world, "body", name=f"{owner}_wall_{k}", mocap="true", pos="0 0 -10")
-            size = " ".join(map(str, WALL_HALF_SIZE))
-            ET.SubElement(box, "geom", type="box", size=size, contype="0", conaffinity=str(bit), material="wall")
+        _add_mocap_walls(world, "ball", _BALL_BIT)
+    return _compile_for_mjx(root, floor_bits=_BODY_BIT | _BALL_BIT)
+
+
+def near_walls_humanoid(mocap: bool) -> mujoco.MjModel:
+    """The humanoid, as ``near_walls_ant``; its parts touch each other as well."""
+    root = ET.parse(_HUMANOID).getroot()
+    world = _find(root, "worldbody")
+    if not mocap:
+        _add_world_walls(world, bodies=1)
+        return _compile_for_c(root)
+    _add_mocap_walls(world, "humanoid", _BODY_BIT)
+    return _compile_for_mjx(root, floor_bits=_BODY_BIT)
+
+
+def _compile_for_c(root: ET.Element) -> mujoco.MjModel:
+    """The walls will move, so the volumes that bound several of them become boundless; each one's own moves with it.
+
+    Without any bounding volumes (``mjDSBL_MIDPHASE``) contacts would be found in another order.
+    """
+    model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+    first, count = model.body_bvhadr[0], model.body_bvhnum[0]
+    inner = first + np.flatnonzero(model.bvh_nodeid[first : first + count] < 0)
+    model.bvh_aabb[inner] = (0, 0, 0, *[_BOUNDLESS] * 3)  # centre, half sizes
+    return model
+
+
+def _compile_for_mjx(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
+    """Only moving geoms have ``contype``, and contacts are capped.
+
+    MJX collides the floor with mocap boxes, which C filters as static. The cap is per contact dimension and keeps the
+    deepest. MJX finds a numeric's value by index, not by address, so that it has to come before any longer one.
+    """
+    floor = _find(_find(root, "worldbody"), "geom[@name='floor']")
+    floor.set("contype", "0")
+    floor.set("conaffinity", str(floor_bits))
+    custom = ET.SubElement(root, "custom")
+    ET.SubElement(custom, "numeric", name="max_contact_points", data=str(_MAX_CONTACTS))
     return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+
+
+def _add_world_walls(world: ET.Element, bodies: int) -> None:
+    """Boxes of the world, as a whole maze has them, so that contacts are found in the same order and bit for bit."""
+    for k in range(WALLS * bodies):
+        _add_box(world, {"name": f"wall_{k}", "pos": "0 0 -100", "contype": "1", "conaffinity": "1"})
+
+
+def _add_mocap_walls(world: ET.Element, owner: str, bit: int) -> None:
+    for k in range(WALLS_AROUND):
+        box = ET.SubElement(world, "body", name=f"{owner}_wall_{k}", mocap="true", pos="0 0 -100")
+        _add_box(box, {"contype": "0", "conaffinity": str(bit)})
+
+
+def _add_box(parent: ET.Element, attributes: dict[str, str]) -> None:
+    size = " ".join(map(str, WALL_HALF_SIZE))
+    ET.SubElement(parent, "geom", {"type": "box", "size": size, "material": "wall"} | attributes)
 
 
 def _add_ball(world: ET.Element) -> ET.Element:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import jax
-import mujoco
 
-from envs.maze import Maze
 from envs.physics.base import Engine, PipelineState, Sensors
 from envs.physics.mujoco_engine import MujocoEngine
 
-__all__ = ["Engine", "MujocoEngine", "PipelineState", "Sensors", "make_engine", "resolve_physics"]
+__all__ = ["Engine", "MujocoEngine", "PipelineState", "Sensors", "resolve_physics"]
 
 ENGINES = ("mjx", "mujoco")
 
@@ -34,12 +32,3 @@ def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
     if physics not in supported:
         raise ValueError(f"this task does not run on {physics!r}; choose auto or {' or '.join(supported)}")
     return physics
-
-
-def make_engine(physics: str, model: mujoco.MjModel, layout: Maze, sensors: Sensors | None = None) -> Engine:
-    """The engine called ``physics`` for the whole-maze ``model`` of ``layout``, which reads ``sensors``."""
-    if resolve_physics(physics) == "mujoco":
-        return MujocoEngine(model, sensors=sensors)
-    from envs.physics.mjx_engine import MjxEngine  # imported here, for MJX takes seconds to load
-
-    return MjxEngine(layout, ball=model.nq > 15)

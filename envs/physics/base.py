@@ -73,6 +73,8 @@ class Engine(Protocol):
     """One control step behind one interface; MJX and MuJoCo C implement it."""
 
     name: str
+    model: mujoco.MjModel
+    frame_skip: int
     nq: int
     nv: int
     nu: int

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +18,11 @@ import numpy as np
 from flax import struct
 from mujoco.batch import Batch
 
+from envs.maze import WALL_HALF_SIZE, Maze
 from envs.physics.base import PipelineState, Sensors
+from envs.physics.walls import WALLS, cells_in_reach
 
+_SUNK = -100.0  # height of a box that stands for no wall
 _SENSED_FIELDS = ("xpos", "xmat", "sensordata")
 
 
@@ -38,7 +42,11 @@ class MujocoEngine:
     """Steps ``model`` on all cores.
 
     Args:
-        model: the compiled model; no activation states and no plugins (the ant and humanoid tasks have none).
+        model: the compiled model; no activation states and no plugins (the ant and humanoid tasks have none). With a
+            layout, it has ``WALLS`` boxes per body, geoms of the world called "wall_0", ...
+        layout: the maze; its walls in reach are put in place before each control step, which is bit for bit the same
+            as with all of them, and costs less. None leaves the model as it is.
+        bodies: where in qpos the x of each free body lies.
         frame_skip: sub-steps per control step.
         threads: threads of the pool; None takes the cores this process may use.
         sensors: what to read after each control step, from a forward pass of the new state; None reads nothing.
@@ -49,13 +57,21 @@ class MujocoEngine:
     def __init__(
         self,
         model: mujoco.MjModel,
+        layout: Maze | None = None,
+        bodies: Sequence[int] = (0,),
         frame_skip: int = 5,
         threads: int | None = None,
         sensors: Sensors | None = None,
     ) -> None:
         self.model = model
         self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
-        self._frame_skip = frame_skip
+        self.frame_skip = frame_skip
+        self._layout = layout
+        self._bodies = list(bodies)
+        walls = [] if layout is None else [model.geom(f"wall_{k}").id for k in range(WALLS * len(self._bodies))]
+        self._wall_geoms = np.asarray(walls, int)
+        world_volumes = model.bvh_nodeid[: model.body_bvhnum[0]]  # the world is the first body
+        self._wall_volumes = np.asarray([np.flatnonzero(world_volumes == geom)[0] for geom in walls], int)
         self._threads = threads or len(os.sched_getaffinity(0))
         self._sensors = sensors
         self._nsensed = sensors.size if sensors else 0
@@ -119,8 +135,9 @@ class MujocoEngine:
             for name, given in (("qpos", qpos), ("qvel", qvel)):
                 held, values = batch.bind(name), np.asarray(given).reshape(n, -1)
                 held[:] = np.where(starts[:, None], values, _with_changes(held, values))
+            self._place_walls(batch)
             batch.bind("ctrl")[:] = np.asarray(action).reshape(n, -1)
-            batch.step(nstep=self._frame_skip, stage=int(stage))
+            batch.step(nstep=self.frame_skip, stage=int(stage))
             new_rows = batch.state.copy()
             sensed = self._read_sensors(batch)
         new_qpos = new_rows[:, 1 : 1 + self.nq].astype(np.float32)
@@ -139,6 +156,27 @@ class MujocoEngine:
             batch.bind("qvel")[:] = np.asarray(qvel).reshape(n, -1)
             batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
             return self._read_sensors(batch).reshape(*lead, self._nsensed)
+
+    def _place_walls(self, batch: Batch) -> None:
+        """Moves the boxes, and the volumes that bound them, to the walls around each body, in the order in which a whole maze has them.
+
+        The order is that in which contacts are solved, and so decides the last bit. A wall near two bodies has one box;
+        boxes without a wall stay out of reach.
+        """
+        if self._layout is None:
+            return
+        qpos = batch.bind("qpos")
+        points = np.stack([qpos[:, place : place + 2] for place in self._bodies], axis=1)
+        cells, is_wall = cells_in_reach(self._layout, points)  # [n, bodies, 4, 2], [n, bodies, 4]
+        n, none = batch.nsim, self._layout.num_cells
+        index = np.where(is_wall, cells[..., 0] * self._layout.grid.shape[1] + cells[..., 1], none).reshape(n, -1)
+        index.sort(axis=1)
+        index[:, 1:][index[:, 1:] == index[:, :-1]] = none
+        index.sort(axis=1)
+        height = np.where(index < none, WALL_HALF_SIZE[2], _SUNK)
+        centres = np.concatenate([self._layout.index_to_xy(index), height[..., None]], axis=-1)
+        batch.expand("geom_pos")[:, self._wall_geoms] = centres
+        batch.expand("bvh_aabb")[:, self._wall_volumes, :3] = centres
 
     def _read_sensors(self, batch: Batch) -> np.ndarray:
         """float32[n, k] of the states that ``batch`` has just made a forward pass of."""

@@ -22,7 +22,12 @@ _ROUNDING = 1e-6  # relative change of an acceleration that float32 cannot bette
 
 
 def solve(
-    mass: jax.Array, smooth: jax.Array, jacobian: jax.Array, stiffness: jax.Array, reference: jax.Array, guess: jax.Array
+    mass: jax.Array,
+    smooth: jax.Array,
+    jacobian: jax.Array,
+    stiffness: jax.Array,
+    reference: jax.Array,
+    guess: jax.Array,
 ) -> jax.Array:
     """The constrained acceleration float[nv].
 

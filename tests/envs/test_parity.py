@@ -61,7 +61,7 @@ def test_rollouts_equal_ogbench_bit_for_bit(name: str) -> None:
         terminated = np.asarray(states.done) * (1 - np.asarray(states.info["truncation"]))
         np.testing.assert_array_equal(terminated, expected["terminated"])
         if kind == "wall":
-            wall_contacts = _wall_contacts(env.engine.model, exact)
+            wall_contacts = _wall_contacts(env.whole_model(), exact)
         if kind == "goal":
             successes = list(np.flatnonzero(expected["success"]))
         if kind == "task":
@@ -125,7 +125,7 @@ def test_sensed_is_fresh_wherever_a_state_comes_from() -> None:
 def test_model_and_task_equal_ogbench(name: str) -> None:
     env = envs.make(name, physics="mujoco")
     reference = ogbench_env(name)
-    ours, theirs = env.engine.model, reference.unwrapped.model
+    ours, theirs = env.whole_model(), reference.unwrapped.model
     names = """geom_type geom_size geom_pos geom_quat geom_friction geom_margin geom_solref geom_solimp geom_condim
         geom_contype geom_conaffinity geom_priority body_mass body_inertia body_pos jnt_type jnt_axis jnt_range
         jnt_stiffness jnt_solimp body_quat body_ipos body_iquat body_parentid dof_armature dof_damping actuator_gear

@@ -60,7 +60,5 @@ def test_one_constraint_by_hand(active: int) -> None:
     """Mass 2, one row along axis ``active`` with D = 6 that asks for 1: minimum at 6 / (2 + 6)."""
     row = np.zeros((1, 4), np.float32)
     row[0, active] = 1.0
-    found = solve(
-        2 * jnp.eye(4), jnp.zeros(4), jnp.asarray(row), jnp.array([6.0]), jnp.array([1.0]), jnp.full(4, 9.0)
-    )
+    found = solve(2 * jnp.eye(4), jnp.zeros(4), jnp.asarray(row), jnp.array([6.0]), jnp.array([1.0]), jnp.full(4, 9.0))
     np.testing.assert_allclose(found, 0.75 * row[0], rtol=1e-6)

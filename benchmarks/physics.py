@@ -1,0 +1,280 @@
+"""How fast the physics is: ``python benchmarks/physics.py [--out results/physics.json]``.
+
+Environment steps per second (one step is one control step of one environment under random actions), seconds from
+nothing compiled to the first step done, and peak memory, of
+
+    stock-mjx     OGBench's own model, all walls, on MJX as it comes (without observation, reward or reset)
+    mjx           our environment on MJX, reset included
+    mujoco        our environment on MuJoCo C, inside jit, reset included
+    bare          the same model in a plain pool of threads, outside jax (without observation, reward or reset)
+    gymnasium     OGBench's environment, one of them
+    async         gymnasium's AsyncVectorEnv around it, one worker per core
+
+Every cell runs in a process of its own, with no compilation cache, one after the other. A cell that does not finish
+in ``--limit`` seconds is reported as such. The table goes to standard output, everything to the JSON file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TASKS = ("antmaze-medium", "antmaze-large", "antmaze-giant", "antsoccer-arena", "humanoidmaze-medium")
+BATCHES = (1, 16, 64, 256)
+KINDS = ("stock-mjx", "mjx", "mujoco", "bare", "gymnasium", "async")
+FRAME_SKIP = 5
+CORES = len(os.sched_getaffinity(0))
+
+
+# --- One cell: a function that makes n steps of all environments -------------------------------------------------
+
+
+def ours(task: str, batch: int, physics: str, control_steps: int) -> Callable[[], int]:
+    """Our environment with auto-reset, ``control_steps`` in one program."""
+    import jax
+
+    import envs
+
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    env = envs.AutoReset(envs.make(task, physics=physics))
+
+    def body(state: Any, key: Any) -> tuple[Any, None]:
+        actions = jax.random.uniform(key, (batch, env.action_size), minval=-1.0)
+        return jax.vmap(env.step)(state, actions), None
+
+    @jax.jit
+    def run(state: Any, key: Any) -> Any:
+        return jax.lax.scan(body, state, jax.random.split(key, control_steps))[0]
+
+    held = [jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), batch)), jax.random.key(1)]
+
+    def steps() -> int:
+        held[1], key = jax.random.split(held[1])
+        held[0] = jax.block_until_ready(run(held[0], key))
+        return batch * control_steps
+
+    return steps
+
+
+def stock_mjx(task: str, batch: int) -> Callable[[], int]:
+    """``mjx.step`` of OGBench's model as it is."""
+    import jax
+    import jax.numpy as jnp
+    from mujoco import mjx
+
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    model = ogbench_env(task).unwrapped.model
+    mjx_model = mjx.put_model(model, impl="jax")
+    data = jax.vmap(lambda _: mjx.make_data(model, impl="jax"))(jnp.arange(batch))
+
+    @jax.jit
+    def run(data: Any, key: Any) -> Any:
+        actions = jax.random.uniform(key, (batch, model.nu), minval=-1.0)
+
+        def substep(data: Any, _: None) -> tuple[Any, None]:
+            return jax.vmap(lambda d, a: mjx.step(mjx_model, d.replace(ctrl=a)))(data, actions), None
+
+        return jax.lax.scan(substep, data, None, length=FRAME_SKIP)[0]
+
+    held = [data, jax.random.key(0)]
+
+    def steps() -> int:
+        held[1], key = jax.random.split(held[1])
+        held[0] = jax.block_until_ready(run(held[0], key))
+        return batch
+
+    return steps
+
+
+def bare(task: str, batch: int, control_steps: int) -> Callable[[], int]:
+    """MuJoCo's own batch stepper on the model, actions ready-made."""
+    from mujoco.batch import Batch
+
+    import envs
+
+    model = envs.make(task, physics="mujoco").engine.model
+    stepper = Batch(model, nsim=batch, nthread=min(CORES, batch))
+    actions = np.random.default_rng(0).uniform(-1, 1, (control_steps, batch, model.nu))
+    ctrl = stepper.bind("ctrl")
+
+    def steps() -> int:
+        for action in actions:
+            ctrl[:] = action
+            stepper.step(nstep=FRAME_SKIP)
+        return batch * control_steps
+
+    return steps
+
+
+def gymnasium_single(task: str, control_steps: int) -> Callable[[], int]:
+    """OGBench's environment in a Python loop."""
+    env = ogbench_env(task)
+    env.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (control_steps, *env.action_space.shape)).astype(np.float32)
+
+    def steps() -> int:
+        for action in actions:
+            *_, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        return control_steps
+
+    return steps
+
+
+def gymnasium_async(task: str, control_steps: int) -> Callable[[], int]:
+    """One worker process per core."""
+    import gymnasium
+
+    env = gymnasium.vector.AsyncVectorEnv([lambda: ogbench_env(task)] * CORES)
+    env.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (control_steps, *env.action_space.shape)).astype(np.float32)
+
+    def steps() -> int:
+        for action in actions:
+            env.step(action)
+        return control_steps * CORES
+
+    return steps
+
+
+def ogbench_env(task: str) -> Any:
+    """OGBench's single-task environment of the same name."""
+    import gymnasium
+    import ogbench  # noqa: F401  (registers the environments)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return gymnasium.make(f"{task}-singletask-v0")
+
+
+def make_cell(kind: str, task: str, batch: int) -> Callable[[], int]:
+    """The function whose calls are timed; it returns how many environment steps it made."""
+    if kind in ("mjx", "mujoco"):
+        return ours(task, batch, kind, control_steps=5 if kind == "mjx" else 50)
+    if kind == "stock-mjx":
+        return stock_mjx(task, batch)
+    if kind == "bare":
+        return bare(task, batch, control_steps=50)
+    return gymnasium_single(task, 300) if kind == "gymnasium" else gymnasium_async(task, 300)
+
+
+def measure(kind: str, task: str, batch: int, seconds: float) -> dict[str, Any]:
+    """Calls the cell for ``seconds`` after a first time; the rate is that of the whole window."""
+    began = time.perf_counter()
+    steps = make_cell(kind, task, batch)
+    steps()
+    first = time.perf_counter() - began
+    made, began = 0, time.perf_counter()
+    while time.perf_counter() - began < seconds or made == 0:
+        made += steps()
+    rate = made / (time.perf_counter() - began)
+    memory = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return {"steps_per_second": round(rate, 1), "first_step_seconds": round(first, 1), "peak_mib": memory // 1024}
+
+
+# --- All cells ---------------------------------------------------------------------------------------------------
+
+
+def run_cell(kind: str, task: str, batch: int, seconds: float, limit: float) -> dict[str, Any]:
+    """``measure`` in a process of its own."""
+    head = {"kind": kind, "task": task, "batch": batch}
+    command = [sys.executable, __file__, "--cell", kind, task, str(batch), "--seconds", str(seconds)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=limit, check=True)
+    except subprocess.TimeoutExpired:
+        return {**head, "error": f"not done in {limit:.0f} s"}
+    except subprocess.CalledProcessError as error:
+        return {**head, "error": (error.stderr.strip().splitlines() or [f"exit {error.returncode}"])[-1]}
+    return {**head, **json.loads(done.stdout.splitlines()[-1])}
+
+
+def cells(tasks: list[str], kinds: list[str], batches: list[int]) -> list[tuple[str, str, int]]:
+    """(kind, task, batch); gymnasium's environments have no choice of batch."""
+    fixed = {"gymnasium": [1], "async": [CORES]}
+    return [(kind, task, batch) for task in tasks for kind in kinds for batch in fixed.get(kind, batches)]
+
+
+def ratios(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Ours at 64 environments against the yardsticks, by task."""
+    speed = {(row["kind"], row["task"], row["batch"]): row.get("steps_per_second") for row in rows}
+    found = []
+    for task in dict.fromkeys(row["task"] for row in rows):
+        gyms = [speed.get(("gymnasium", task, 1)), speed.get(("async", task, CORES))]
+        known = [rate for rate in gyms if rate]
+        row = {
+            "task": task,
+            "mujoco / best gymnasium": _ratio(speed.get(("mujoco", task, 64)), max(known, default=None)),
+            "mujoco / bare": _ratio(speed.get(("mujoco", task, 64)), speed.get(("bare", task, 64))),
+            "mjx / stock-mjx": _ratio(speed.get(("mjx", task, 64)), speed.get(("stock-mjx", task, 64))),
+        }
+        found.append(row)
+    return found
+
+
+def _ratio(a: float | None, b: float | None) -> float | None:
+    return round(a / b, 2) if a and b else None
+
+
+def write(path: Path, rows: list[dict[str, Any]], seconds: float) -> None:
+    """The JSON file, whole or not at all."""
+    import jax
+    import mujoco
+
+    machine = {"processor": platform.processor() or platform.machine(), "cores": CORES}
+    versions = {"python": platform.python_version(), "jax": jax.__version__, "mujoco": mujoco.__version__}
+    content = {"machine": machine | versions, "seconds": seconds, "cells": rows, "ratios": ratios(rows)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(content, indent=1) + "\n")
+    temporary.replace(path)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS))
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--batches", nargs="+", type=int, default=list(BATCHES))
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of a measurement (default 5)")
+    parser.add_argument(
+        "--limit", type=float, default=300.0, help="seconds after which a cell is given up (default 300)"
+    )
+    parser.add_argument("--out", type=Path, help="JSON file")
+    parser.add_argument("--cell", nargs=3, metavar=("KIND", "TASK", "BATCH"), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.cell:
+        kind, task, batch = args.cell
+        print(json.dumps(measure(kind, task, int(batch), args.seconds)))
+        return
+    rows = []
+    print(f"{'task':20s} {'kind':10s} {'batch':>5s} {'steps/s':>9s} {'first, s':>8s} {'MiB':>6s}")
+    for kind, task, batch in cells(args.tasks, args.kinds, args.batches):
+        row = run_cell(kind, task, batch, args.seconds, args.limit)
+        rows.append(row)
+        numbers = (
+            row["error"]
+            if "error" in row
+            else f"{row['steps_per_second']:9.1f} {row['first_step_seconds']:8.1f} {row['peak_mib']:6d}"
+        )
+        print(f"{task:20s} {kind:10s} {batch:5d} {numbers}", flush=True)
+        if args.out:
+            write(args.out, rows, args.seconds)
+    for row in ratios(rows):
+        print("  ".join(f"{key} {value}" for key, value in row.items() if value is not None))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""The bodies of the tasks: which models they are stepped and drawn with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import mujoco
+
+from envs import models
+from envs.maze import Maze
+from envs.physics import Engine, MujocoEngine, Sensors
+
+
+@dataclass(frozen=True)
+class Body:
+    """What moves in a maze.
+
+    Attributes:
+        whole: makes the model with every wall of a maze, as OGBench has it: for drawing, and to compare with.
+        near: makes the model on an open floor with the few walls in reach; True for movable (mocap) walls, which MJX
+            wants, False for walls that belong to the world, which MuJoCo C wants.
+        places: where in qpos the x of each free body lies, the walking one first.
+        sensors: what is observed besides qpos and qvel.
+    """
+
+    whole: Callable[[Maze], mujoco.MjModel]
+    near: Callable[[bool], mujoco.MjModel]
+    places: tuple[int, ...] = (0,)
+    sensors: Sensors | None = None
+
+    def engine(self, physics: str, layout: Maze) -> Engine:
+        """The engine called "mjx" or "mujoco" for this body in ``layout``."""
+        if physics == "mujoco":
+            return MujocoEngine(self.near(False), layout, self.places, sensors=self.sensors)
+        from envs.physics.mjx_engine import MjxEngine  # imported here, for MJX takes seconds to load
+
+        return MjxEngine(self.near(True), layout, self.places, sensors=self.sensors)
+
+
+ANT = Body(models.ant_model, models.near_walls_ant)
+
+ANT_AND_BALL = Body(
+    partial(models.ant_model, ball=True),
+    partial(models.near_walls_ant, ball=True),
+    places=(0, 15),  # the ant's 15 numbers come first
+)
+
+HUMANOID = Body(
+    models.humanoid_model,
+    models.near_walls_humanoid,
+    sensors=Sensors(
+        root="torso",
+        heights=("head",),
+        limbs=("left_hand", "left_foot", "right_hand", "right_foot"),
+        velocity="torso_subtreelinvel",
+    ),
+)
