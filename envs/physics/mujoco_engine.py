@@ -158,10 +158,10 @@ class MujocoEngine:
             return self._read_sensors(batch).reshape(*lead, self._nsensed)
 
     def _place_walls(self, batch: Batch) -> None:
-        """Moves the boxes, and the volumes that bound them, to the walls around each body, in the order in which a whole maze has them.
+        """Moves the boxes, and the volumes that bound them, to the walls around each body.
 
-        The order is that in which contacts are solved, and so decides the last bit. A wall near two bodies has one box;
-        boxes without a wall stay out of reach.
+        They come in the order of the whole maze, in which contacts are solved, and which so decides the last bit. A
+        wall near two bodies has one box; boxes without a wall stay out of reach.
         """
         if self._layout is None:
             return
