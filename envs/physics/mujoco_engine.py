@@ -135,9 +135,11 @@ class MujocoEngine:
             for name, given in (("qpos", qpos), ("qvel", qvel)):
                 held, values = batch.bind(name), np.asarray(given).reshape(n, -1)
                 held[:] = np.where(starts[:, None], values, _with_changes(held, values))
+            sound = np.isfinite(batch.state).all(axis=1)
             self._place_walls(batch)
             batch.bind("ctrl")[:] = np.asarray(action).reshape(n, -1)
-            batch.step(nstep=self.frame_skip, stage=int(stage))
+            # A state that is not finite stays as it is, for the task to see; MuJoCo would spend long on it.
+            batch.step(ids=None if sound.all() else np.flatnonzero(sound), nstep=self.frame_skip, stage=int(stage))
             new_rows = batch.state.copy()
             sensed = self._read_sensors(batch)
         new_qpos = new_rows[:, 1 : 1 + self.nq].astype(np.float32)
@@ -166,7 +168,7 @@ class MujocoEngine:
         if self._layout is None:
             return
         qpos = batch.bind("qpos")
-        points = np.stack([qpos[:, place : place + 2] for place in self._bodies], axis=1)
+        points = np.nan_to_num(np.stack([qpos[:, place : place + 2] for place in self._bodies], axis=1))
         cells, is_wall = cells_in_reach(self._layout, points)  # [n, bodies, 4, 2], [n, bodies, 4]
         n, none = batch.nsim, self._layout.num_cells
         index = np.where(is_wall, cells[..., 0] * self._layout.grid.shape[1] + cells[..., 1], none).reshape(n, -1)
