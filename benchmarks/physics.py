@@ -6,7 +6,7 @@ nothing compiled to the first step done, and peak memory, of
     stock-mjx     OGBench's own model, all walls, on MJX as it comes (without observation, reward or reset)
     mjx           our environment on MJX, reset included
     mujoco        our environment on MuJoCo C, inside jit, reset included
-    bare          the same model in a plain pool of threads, outside jax (without observation, reward or reset)
+    bare          OGBench's model, all walls, in a plain pool of threads (without observation, reward or reset)
     gymnasium     OGBench's environment, one of them
     async         gymnasium's AsyncVectorEnv around it, one worker per core
 
@@ -99,13 +99,17 @@ def stock_mjx(task: str, batch: int) -> Callable[[], int]:
 
 
 def bare(task: str, batch: int, control_steps: int) -> Callable[[], int]:
-    """MuJoCo's own batch stepper on the model, actions ready-made."""
+    """MuJoCo's own batch stepper on the task's model with all walls, from the task's starts, actions ready-made."""
+    import jax
     from mujoco.batch import Batch
 
     import envs
 
-    model = envs.make(task, physics="mujoco").engine.model
+    env = envs.make(task, physics="mujoco")
+    starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), batch)).pipeline_state
+    model = env.whole_model()
     stepper = Batch(model, nsim=batch, nthread=min(CORES, batch))
+    stepper.bind("qpos")[:], stepper.bind("qvel")[:] = starts.qpos, starts.qvel
     actions = np.random.default_rng(0).uniform(-1, 1, (control_steps, batch, model.nu))
     ctrl = stepper.bind("ctrl")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -64,7 +65,7 @@ class AutoReset(Env):
         after = self.env.step(state, action)
         bad = ~_is_finite((after.pipeline_state.qpos, after.pipeline_state.qvel, after.obs, after.reward))
         done = bad | (after.done > 0)
-        fresh = self.env.reset(state.info["reset_key"])
+        fresh = _when_any(self.env.reset)(done, state.info["reset_key"])
 
         def start_anew(new: Any, old: Any) -> Any:
             return jax.tree.map(lambda n, o: jnp.where(done, n, o), new, old)
@@ -81,6 +82,40 @@ class AutoReset(Env):
             metrics=after.metrics | {"nan": bad.astype(jnp.float32)},
             info=info,
         )
+
+
+def _when_any(reset: Callable[[jax.Array], State]) -> Callable[[jax.Array, jax.Array], State]:
+    """``reset`` as a function of (wanted, key) that is skipped, and gives zeros, unless some of the batch want it.
+
+    Few steps end an episode, and a reset can cost as much as a step. Under ``vmap`` an ordinary ``cond`` would compute
+    both branches; here the batch decides together, through any number of axes.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def conditional(wanted: jax.Array, key: jax.Array) -> State:
+        shapes = jax.eval_shape(reset, key)
+
+        def nothing(key: jax.Array) -> State:
+            return jax.tree.map(lambda leaf: _blank(leaf, key), shapes)
+
+        return jax.lax.cond(wanted, reset, nothing, key)
+
+    @conditional.def_vmap
+    def batched(size: int, is_batched: list[bool], wanted: jax.Array, key: jax.Array) -> tuple[State, Any]:
+        if not is_batched[1]:
+            key = jnp.broadcast_to(key, (size, *key.shape))
+        any_wanted = wanted.any(axis=0) if is_batched[0] else wanted
+        out = _when_any(jax.vmap(reset))(any_wanted, key)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return conditional
+
+
+def _blank(leaf: jax.ShapeDtypeStruct, key: jax.Array) -> jax.Array:
+    """Zeros, or where a key is wanted, the one at hand."""
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(key, leaf.shape)
+    return jnp.zeros(leaf.shape, leaf.dtype)
 
 
 def _with_nan_count(state: State) -> State:
