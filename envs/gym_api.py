@@ -19,10 +19,10 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from envs.brax_base import State
 from envs.registry import get_spec, list_tasks, make
 from envs.render import Renderer, steps_per_second
 from envs.task import TaskEnv
@@ -31,7 +31,34 @@ from envs.wrappers import AutoReset
 _METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10.0}
 
 
-class TaskGymEnv(gymnasium.Env):
+class _Backed:
+    """What one environment and a batch have in common: the programs, the renderer and the state."""
+
+    metadata: dict[str, Any]
+
+    def _open(self, task: str, physics: str, render_mode: str | None, frames: Mapping[str, Any]) -> None:
+        self._programs = _programs(get_spec(task).full_name, physics)
+        self.task = self._programs.task
+        self.metadata = self.metadata | {"render_fps": steps_per_second(self.task)}
+        self.render_mode = render_mode
+        self._renderer = _renderer(self.task, render_mode, frames)
+        self._state: State | None = None
+
+    def _frames(self) -> tuple[np.ndarray, ...] | None:
+        """Every environment's state as uint8[height, width, 3]; None without a render mode."""
+        if self._renderer is None:
+            return None
+        state = _started(self._state)
+        states = zip(np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal_xy"]), strict=True)
+        return tuple(self._renderer.frame(qpos, goal_xy) for qpos, goal_xy in states)
+
+    def _release(self) -> None:
+        """Gives the OpenGL context back."""
+        if self._renderer is not None:
+            self._renderer.close()
+
+
+class TaskGymEnv(_Backed, gymnasium.Env):
     """One environment.
 
     ``info["success"]`` (bool) tells of the step just made. Physics that is no longer finite truncates the episode, with
@@ -54,13 +81,8 @@ class TaskGymEnv(gymnasium.Env):
     metadata = _METADATA
 
     def __init__(self, task: str, physics: str = "auto", render_mode: str | None = None, **frames: Any) -> None:
-        self._programs = _programs(get_spec(task).full_name, physics)
-        self.task = self._programs.task
+        self._open(task, physics, render_mode, frames)
         self.observation_space, self.action_space = self._programs.spaces
-        self.metadata = _METADATA | {"render_fps": steps_per_second(self.task)}
-        self.render_mode = render_mode
-        self._renderer = _renderer(self.task, render_mode, frames)
-        self._state: State | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -98,17 +120,15 @@ class TaskGymEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """The state as uint8[height, width, 3]; None without a render mode."""
-        if self._renderer is None:
-            return None
-        return _frames(self._renderer, _started(self._state))[0]
+        frames = self._frames()
+        return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Gives the OpenGL context back."""
-        if self._renderer is not None:
-            self._renderer.close()
+        self._release()
 
 
-class TaskVectorEnv(gymnasium.vector.VectorEnv):
+class TaskVectorEnv(_Backed, gymnasium.vector.VectorEnv):
     """A batch of environments, stepped by one compiled program.
 
     An environment whose episode ends starts the next one in the same step (``AutoresetMode.SAME_STEP``): the true last
@@ -138,15 +158,10 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         self.num_envs = num_envs
-        self._programs = _programs(get_spec(task).full_name, physics)
-        self.task = self._programs.task
+        self._open(task, physics, render_mode, frames)
         self.single_observation_space, self.single_action_space = self._programs.spaces
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.metadata = self.metadata | {"render_fps": steps_per_second(self.task)}
-        self.render_mode = render_mode
-        self._renderer = _renderer(self.task, render_mode, frames)
-        self._state: State | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -191,12 +206,11 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Every environment's state as uint8[height, width, 3]; None without a render mode."""
-        return None if self._renderer is None else _frames(self._renderer, _started(self._state))
+        return self._frames()
 
     def close_extras(self) -> None:
         """Gives the OpenGL context back."""
-        if self._renderer is not None:
-            self._renderer.close()
+        self._release()
 
     def _everywhere(self) -> np.ndarray:
         return np.ones(self.num_envs, bool)
@@ -307,11 +321,6 @@ def _renderer(task: TaskEnv, render_mode: str | None, frames: Mapping[str, Any])
     if render_mode not in _METADATA["render_modes"]:
         raise ValueError(f"there is no render mode {render_mode!r}; choose rgb_array or None")
     return Renderer(task, **frames)
-
-
-def _frames(renderer: Renderer, state: State) -> tuple[np.ndarray, ...]:
-    states = zip(np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal_xy"]), strict=True)
-    return tuple(renderer.frame(qpos, goal_xy) for qpos, goal_xy in states)
 
 
 def _register() -> None:

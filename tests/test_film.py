@@ -29,15 +29,6 @@ CAP = 25
 
 
 @pytest.fixture
-def opengl() -> None:
-    """Skips where there is no OpenGL, with the line that a user would see."""
-    try:
-        render.Renderer(envs.make("antmaze-medium", physics="mujoco"), 16, 16).close()
-    except render.NoOpenGL as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture
 def finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run folder of two members, with everything that an evaluation reads; episodes are cut short."""
     monkeypatch.setattr(envs.TaskEnv, "episode_length", CAP)

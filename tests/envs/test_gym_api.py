@@ -45,15 +45,6 @@ def short(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     gym_api._programs.cache_clear()
 
 
-@pytest.fixture
-def opengl() -> None:
-    """Skips where there is no OpenGL, with the line that a user would see."""
-    try:
-        render.Renderer(envs.make("antmaze-medium", physics="mujoco"), 16, 16).close()
-    except render.NoOpenGL as error:
-        pytest.skip(str(error))
-
-
 def put(env: Any, qpos: Any, qvel: Any) -> None:
     """Sets the states of all environments: qpos[N, nq], qvel[N, nv]."""
     keys = jax.random.split(jax.random.key(5), len(qpos))

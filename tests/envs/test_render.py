@@ -24,15 +24,6 @@ def fresh_probe() -> Iterator[None]:
     render._headless_way.cache_clear()
 
 
-@pytest.fixture
-def opengl() -> None:
-    """Skips where there is no OpenGL, with the line that a user would see."""
-    try:
-        render.Renderer(LARGE, 16, 16).close()
-    except render.NoOpenGL as error:
-        pytest.skip(str(error))
-
-
 def pixel(layout, xy, z, height, width):
     """Row and column where a camera straight above, with MuJoCo's 45 degrees, sees the point (x, y, z)."""
     rows, columns = layout.grid.shape
@@ -110,6 +101,14 @@ def test_a_closed_renderer_says_so() -> None:
     renderer.close()
     with pytest.raises(ValueError, match="closed"):
         renderer.frame(QPOS, LARGE.goal_xy)
+
+
+def test_drawing_leaves_the_engines_model_alone(opengl: None) -> None:
+    before = LARGE.engine.model.geom_pos.copy()
+    with render.Renderer(LARGE, 16, 16) as renderer:
+        renderer.frame(QPOS, (4.0, 4.0))
+    np.testing.assert_array_equal(LARGE.engine.model.geom_pos, before)
+    assert LARGE.whole_model().geom("target").pos[0] == 0  # and the next whole one is as it should be
 
 
 def test_wrong_frames() -> None:

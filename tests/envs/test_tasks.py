@@ -62,6 +62,8 @@ def test_names() -> None:
     with pytest.raises(ValueError, match="auto, mjx or mujoco"):
         envs.make("antmaze", physics="bullet")
     assert resolve_physics("auto", ("mjx",)) == "mjx"  # the only one it has, whatever the hardware
+    with pytest.raises(ValueError, match="does not run on 'mjx'; choose auto or mujoco"):
+        resolve_physics("mjx", ("mujoco",))
 
 
 def test_listing_loads_no_jax() -> None:
