@@ -29,12 +29,14 @@ import numpy as np
 import envs
 from envs.models import MAX_CONTACTS
 from qdos_brax.experts import walker
+from qdos_brax.runs.folder import write_text
 
 STATES = 1000
 ROLLOUTS = 125  # also the batch of every compiled step
 EVERY = 5  # control steps between two states taken from a rollout
 REPLAYED = 10  # rollouts that are replayed in OGBench
 DRIFT_STEPS = 100
+HOLD = 4  # control steps for which a random action is held
 
 
 class States(NamedTuple):
@@ -57,7 +59,7 @@ class Policy:
         rng = np.random.default_rng(seed)
         angle = rng.uniform(-np.pi, np.pi, ROLLOUTS)
         direction = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1), jnp.float32)
-        self._random = rng.uniform(-1, 1, (1000, ROLLOUTS, env.action_size)).astype(np.float32)
+        self._random = rng.uniform(-1, 1, (DRIFT_STEPS // HOLD, ROLLOUTS, env.action_size)).astype(np.float32)
         self._walks = (np.arange(ROLLOUTS) < ROLLOUTS // 2)[:, None]
         if env.action_size == walker.ACTION_DIM:
             act = walker.load().act
@@ -66,8 +68,8 @@ class Policy:
             self._walk = None
 
     def act(self, step: int, state: Any) -> np.ndarray:
-        """float32[ROLLOUTS, nu]; random actions are held for four steps."""
-        action = self._random[step // 4]
+        """float32[ROLLOUTS, nu]; ``step`` is below ``DRIFT_STEPS``."""
+        action = self._random[step // HOLD]
         if self._walk is None:
             return action
         return np.where(self._walks, np.asarray(self._walk(state.qpos, state.qvel)), action)
@@ -197,11 +199,15 @@ def quantiles(values: np.ndarray) -> dict[str, float]:
     return {"count": len(values), **{key: float(f"{value:.3g}") for key, value in marks.items()}}
 
 
+def both_engines(task: str) -> tuple[Any, Any, Any, Any]:
+    """The task on MuJoCo C, its compiled batched step, the engine on MJX, and its step."""
+    env, mjx_engine = envs.make(task, physics="mujoco"), envs.make(task, physics="mjx").engine
+    return env, jax.jit(jax.vmap(env.engine.step)), mjx_engine, jax.jit(jax.vmap(mjx_engine.step))
+
+
 def examine(task: str) -> dict[str, Any]:
     """All figures of one task."""
-    env = envs.make(task, physics="mujoco")
-    mjx_engine = envs.make(task, physics="mjx").engine
-    c_step, mjx_step = jax.jit(jax.vmap(env.engine.step)), jax.jit(jax.vmap(mjx_engine.step))
+    env, c_step, mjx_engine, mjx_step = both_engines(task)
     teleports = env.layout.teleporters is not None  # to exits that OGBench draws from a generator of its own
     return {
         "mujoco_against_ogbench": None if teleports else against_ogbench(env, c_step),
@@ -225,9 +231,7 @@ def main() -> None:
         print(task, f"({time.perf_counter() - began:.0f} s)", json.dumps(found[task]), flush=True)
         if args.out:
             args.out.parent.mkdir(parents=True, exist_ok=True)
-            temporary = args.out.with_suffix(".tmp")
-            temporary.write_text(json.dumps(found, indent=1) + "\n")
-            temporary.replace(args.out)
+            write_text(args.out, json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -237,13 +237,13 @@ def write(path: Path, rows: list[dict[str, Any]], seconds: float) -> None:
     import jax
     import mujoco
 
+    from qdos_brax.runs.folder import write_text
+
     machine = {"processor": platform.processor() or platform.machine(), "cores": CORES}
     versions = {"python": platform.python_version(), "jax": jax.__version__, "mujoco": mujoco.__version__}
     content = {"machine": machine | versions, "seconds": seconds, "cells": rows, "ratios": ratios(rows)}
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(content, indent=1) + "\n")
-    temporary.replace(path)
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def main() -> None:
