@@ -27,7 +27,6 @@ import mujoco
 import numpy as np
 
 import envs
-from envs.models import MAX_CONTACTS
 from qdos_brax.experts import walker
 from qdos_brax.runs.folder import write_text
 
@@ -167,7 +166,7 @@ def one_step_errors(env: Any, c_step: Any, mjx_engine: Any, mjx_step: Any) -> di
     error = np.concatenate(errors)
     touched, counts = touching(env, states)
     dims = sorted({dim for count in counts for dim in count})
-    dropped = np.mean([max(count.values(), default=0) > MAX_CONTACTS for count in counts])
+    dropped = np.mean([any(count[dim] > most for dim, most in env.body.most_contacts.items()) for count in counts])
     return {
         "free": quantiles(error[~touched]),
         "touching": quantiles(error[touched]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -22,11 +22,13 @@ class Body:
         near: makes the model on an open floor with the few walls in reach; True for movable (mocap) walls, which MJX
             wants, False for walls that belong to the world, which MuJoCo C wants.
         places: where in qpos the x of each free body lies, the walking one first.
+        most_contacts: by contact dimension, how many MJX keeps; benchmarks/exactness.py counts what that drops.
         sensors: what is observed besides qpos and qvel.
     """
 
     whole: Callable[[Maze], mujoco.MjModel]
     near: Callable[[bool], mujoco.MjModel]
+    most_contacts: Mapping[int, int]
     places: tuple[int, ...] = (0,)
     sensors: Sensors | None = None
 
@@ -36,20 +38,22 @@ class Body:
             return MujocoEngine(self.near(False), layout, self.places, sensors=self.sensors)
         from envs.physics.mjx_engine import MjxEngine  # imported here, for MJX takes seconds to load
 
-        return MjxEngine(self.near(True), layout, self.places, sensors=self.sensors)
+        return MjxEngine(self.near(True), layout, self.most_contacts, self.places, sensors=self.sensors)
 
 
-ANT = Body(models.ant_model, models.near_walls_ant)
+ANT = Body(models.ant_model, models.near_walls_ant, most_contacts={3: 8})
 
 ANT_AND_BALL = Body(
     partial(models.ant_model, ball=True),
     partial(models.near_walls_ant, ball=True),
+    most_contacts={3: 8, 6: 6},
     places=(0, 15),  # the ant's 15 numbers come first
 )
 
 HUMANOID = Body(
     models.humanoid_model,
     models.near_walls_humanoid,
+    most_contacts={1: 12, 3: 12},
     sensors=Sensors(
         root="torso",
         heights=("head",),

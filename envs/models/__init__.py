@@ -18,7 +18,6 @@ _HUMANOID = Path(__file__).with_name("humanoid.xml")
 _BODY_BIT, _KICK_BIT, _BALL_BIT = 1, 2, 4
 
 _BOUNDLESS = 1e6
-MAX_CONTACTS = 12  # per contact dimension; benchmarks/exactness.py counts what that drops
 
 
 def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
@@ -106,16 +105,10 @@ def _compile_for_c(root: ET.Element) -> mujoco.MjModel:
 
 
 def _compile_for_mjx(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
-    """Only moving geoms have ``contype``, and contacts are capped.
-
-    MJX collides the floor with mocap boxes, which C filters as static. The cap is per contact dimension and keeps the
-    deepest. MJX finds a numeric's value by index, not by address, so that it has to come before any longer one.
-    """
+    """Only moving geoms have ``contype``: MJX collides the floor with mocap boxes, which C filters as static."""
     floor = _find(_find(root, "worldbody"), "geom[@name='floor']")
     floor.set("contype", "0")
     floor.set("conaffinity", str(floor_bits))
-    custom = ET.SubElement(root, "custom")
-    ET.SubElement(custom, "numeric", name="max_contact_points", data=str(MAX_CONTACTS))
     return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 

@@ -7,13 +7,13 @@
 - *Sphere or capsule and box.* MJX has no contact before the geoms overlap; C has one as soon as they are within the
   margin. Here both are reckoned from the nearest points, as in C.
 
-``exact_contacts`` puts these in place while a function of ours is traced, and leaves MJX as it was.
+``COLLIDERS`` has these, and MJX's own functions for all other pairs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any
 
 import jax
@@ -24,19 +24,10 @@ from mujoco.mjx._src import collision_driver
 # (distance, position[3], frame[3, 3]) of one contact; frame rows: normal from the first geom to the second, tangents
 Contact = tuple[jax.Array, jax.Array, jax.Array]
 
+Vector = Sequence[Any]
+"""The arrays x, y and z: apart from each other, so that all of this becomes one loop over many pairs at a time."""
+
 _NONE = 1.0  # distance of a contact that is none
-
-
-@contextmanager
-def exact_contacts() -> Iterator[None]:
-    """While active, functions traced by jax find the contacts above as MuJoCo C does."""
-    table = collision_driver._COLLISION_FUNC
-    upstream = {pair: table[pair] for pair in _EXACT}
-    table.update(_EXACT)
-    try:
-        yield
-    finally:
-        table.update(upstream)
 
 
 def plane_capsule_frame(normal: jax.Array, axis: jax.Array) -> jax.Array:
@@ -52,29 +43,33 @@ def plane_capsule_frame(normal: jax.Array, axis: jax.Array) -> jax.Array:
     return jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
 
 
-def sphere_box(centre: jax.Array, radius: jax.Array, half_size: jax.Array) -> Contact:
-    """The contact of a sphere with a box, in the box's frame.
+def sphere_box(centre: Vector, radius: jax.Array, half_size: Vector) -> tuple[jax.Array, Vector, Vector]:
+    """Distance, position and normal of the contact of a sphere with a box, in the box's frame.
 
     Args:
-        centre: float[3], of the sphere.
+        centre: of the sphere.
         radius: float[].
-        half_size: float[3], of the box.
+        half_size: of the box.
     """
-    nearest = jnp.clip(centre, -half_size, half_size)
-    away = nearest - centre
-    gap = jnp.linalg.norm(away)
+    away = [jnp.clip(c, -h, h) - c for c, h in zip(centre, half_size, strict=True)]
+    gap = jnp.sqrt(_dot(away, away))
     outside = gap > 0
     # centre inside the box: out through the nearest face
-    depths = half_size - jnp.abs(centre)
-    face = jnp.argmin(depths)
-    inwards = -jax.nn.one_hot(face, 3) * jnp.where(centre[face] < 0, -1.0, 1.0)
-    normal = jnp.where(outside, away / jnp.where(outside, gap, 1.0), inwards)
-    distance = jnp.where(outside, gap, -depths[face]) - radius
-    return distance, centre + normal * (radius + distance / 2), _frame(normal)
+    depths = [h - jnp.abs(c) for c, h in zip(centre, half_size, strict=True)]
+    depth = reduce(jnp.minimum, depths)
+    is_face = (depths[0] == depth, depths[1] == depth, depths[2] == depth)
+    first = (is_face[0], is_face[1] & ~is_face[0], is_face[2] & ~is_face[1] & ~is_face[0])
+    inwards = (jnp.where(f, jnp.where(c < 0, 1.0, -1.0), 0.0) for f, c in zip(first, centre, strict=True))
+    length = jnp.where(outside, gap, 1.0)
+    normal = [jnp.where(outside, a / length, i) for a, i in zip(away, inwards, strict=True)]
+    distance = jnp.where(outside, gap, -depth) - radius
+    return distance, _go(centre, radius + distance / 2, normal), normal
 
 
-def capsule_box(centre: jax.Array, half_axis: jax.Array, radius: jax.Array, half_size: jax.Array) -> Contact:
-    """Two contacts of a capsule with a box, in the box's frame; leading axis 2 on everything.
+def capsule_box(
+    centre: Vector, half_axis: Vector, radius: jax.Array, half_size: Vector
+) -> list[tuple[jax.Array, Vector, Vector]]:
+    """Distance, position and normal of both contacts of a capsule with a box, in the box's frame.
 
     One at the point of the capsule's segment nearest to the box, and a second one further along, so that a capsule
     along a wall is held at two points. MuJoCo C's choice of the second, for boxes that are large against the capsule:
@@ -84,60 +79,90 @@ def capsule_box(centre: jax.Array, half_axis: jax.Array, radius: jax.Array, half
       edge, and only if it draws away along the other.
 
     Args:
-        centre: float[3], of the capsule.
-        half_axis: float[3], from the centre to one end of the segment.
+        centre: of the capsule.
+        half_axis: from the centre to one end of the segment.
         radius: float[].
-        half_size: float[3], of the box.
+        half_size: of the box.
     """
-    end_inside = (jnp.abs(centre - half_axis) <= half_size).all()  # the axis itself is in the box: one end will do
+    start = _go(centre, -1.0, half_axis)
+    end_inside = reduce(jnp.logical_and, (jnp.abs(s) <= h for s, h in zip(start, half_size, strict=True)))
+    # an axis that begins in the box: one end will do
     first = jnp.where(end_inside, -1.0, _nearest_on_segment(centre, half_axis, half_size))
-    point = centre + first * half_axis
-    outside = jnp.abs(point) > half_size
-    at_face = outside.sum() == 1
+    point = _go(centre, first, half_axis)
+    outside = [jnp.abs(p) > h for p, h in zip(point, half_size, strict=True)]
+    at_face = sum(o.astype(jnp.int32) for o in outside) == 1
 
-    slope = jnp.where(jnp.abs(half_axis) > 1e-9, half_axis, 1e-9)
-    spans = jnp.stack([(-half_size - centre) / slope, (half_size - centre) / slope])
-    over_box = jnp.where(outside, jnp.array([[-1.0], [1.0]]), jnp.stack([spans.min(axis=0), spans.max(axis=0)]))
-    low, high = jnp.clip(over_box[0].max(), -1.0, 1.0), jnp.clip(over_box[1].min(), -1.0, 1.0)
+    spans = [_span(*axis) for axis in zip(centre, half_axis, half_size, strict=True)]
+    low = reduce(jnp.maximum, (jnp.where(o, -1.0, span[0]) for o, span in zip(outside, spans, strict=True)))
+    high = reduce(jnp.minimum, (jnp.where(o, 1.0, span[1]) for o, span in zip(outside, spans, strict=True)))
+    low, high = jnp.clip(low, -1.0, 1.0), jnp.clip(high, -1.0, 1.0)
     beyond_face = jnp.where(first - low > high - first, low, high)
 
-    draws_in = (half_axis * point < 0) & outside  # going towards t = 1
-    longer = jnp.argmax(jnp.where(outside, jnp.abs(half_axis), -1.0))
-    beyond_edge = jnp.where(draws_in[longer], high, low)
+    draws_in = [(a * p < 0) & o for a, p, o in zip(half_axis, point, outside, strict=True)]  # going towards t = 1
+    across = [jnp.where(o, jnp.abs(a), -1.0) for a, o in zip(half_axis, outside, strict=True)]
+    longest_draws_in, longest = draws_in[0], across[0]
+    for draws, length in zip(draws_in[1:], across[1:], strict=True):
+        longest_draws_in = jnp.where(length > longest, draws, longest_draws_in)
+        longest = jnp.maximum(longest, length)
+    beyond_edge = jnp.where(longest_draws_in, high, low)
 
     second = jnp.where(at_face, beyond_face, beyond_edge)
-    has_second = at_face | (draws_in.sum() == 1)
-    at = jnp.stack([first, second])
-    distance, position, frame = jax.vmap(lambda t: sphere_box(centre + t * half_axis, radius, half_size))(at)
-    return distance.at[1].set(jnp.where(has_second, distance[1], _NONE)), position, frame
+    has_second = at_face | (sum(d.astype(jnp.int32) for d in draws_in) == 1)
+    near = sphere_box(point, radius, half_size)
+    far = sphere_box(_go(centre, second, half_axis), radius, half_size)
+    return [near, (jnp.where(has_second, far[0], _NONE), *far[1:])]
 
 
-def _nearest_on_segment(centre: jax.Array, half_axis: jax.Array, half_size: jax.Array) -> jax.Array:
+def _nearest_on_segment(centre: Vector, half_axis: Vector, half_size: Vector) -> jax.Array:
     """The t in [-1, 1] for which ``centre + t * half_axis`` is nearest to the box.
 
     The derivative of half the squared distance rises with t and is linear between the values of t at which a
     coordinate enters or leaves the box's range: its root lies between two neighbouring ones.
     """
-    slope = jnp.where(jnp.abs(half_axis) > 1e-9, half_axis, 1e-9)
-    breaks = jnp.concatenate([(-half_size - centre) / slope, (half_size - centre) / slope, jnp.array([-1.0, 1.0])])
-    breaks = jnp.clip(breaks, -1.0, 1.0)
-    points = centre + breaks[:, None] * half_axis
-    rise = (points - jnp.clip(points, -half_size, half_size)) @ half_axis
-    before = rise <= 0
-    low = jnp.max(jnp.where(before, breaks, -1.0))
-    high = jnp.min(jnp.where(before, 1.0, breaks))
-    rise_low = jnp.max(jnp.where(before, rise, -jnp.inf))
-    rise_high = jnp.min(jnp.where(before, jnp.inf, rise))
+    one = jnp.ones_like(centre[0])
+    breaks = [-one, one]
+    for axis in zip(centre, half_axis, half_size, strict=True):
+        breaks += [jnp.clip(t, -1.0, 1.0) for t in _span(*axis)]
+    low, high, rise_low, rise_high = -one, one, -jnp.inf * one, jnp.inf * one
+    for t in breaks:
+        rise = sum(
+            (p - jnp.clip(p, -h, h)) * a
+            for p, a, h in zip(_go(centre, t, half_axis), half_axis, half_size, strict=True)
+        )
+        before = rise <= 0
+        low, high = jnp.where(before, jnp.maximum(low, t), low), jnp.where(before, high, jnp.minimum(high, t))
+        rise_low = jnp.where(before, jnp.maximum(rise_low, rise), rise_low)
+        rise_high = jnp.where(before, rise_high, jnp.minimum(rise_high, rise))
+    some, all_ = jnp.isfinite(rise_low), ~jnp.isfinite(rise_high)
     between = low - rise_low * (high - low) / jnp.where(rise_high > rise_low, rise_high - rise_low, 1.0)
-    return jnp.where(before.all(), 1.0, jnp.where(before.any(), between, -1.0))
+    return jnp.where(all_, 1.0, jnp.where(some, between, -1.0))
 
 
-def _frame(normal: jax.Array) -> jax.Array:
-    """MuJoCo's contact frame float[3, 3] about ``normal[3]``, with its choice of tangents."""
-    hint = jnp.where(jnp.abs(normal[1]) < 0.5, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
-    tangent = hint - normal * jnp.dot(normal, hint)
-    tangent = tangent / jnp.linalg.norm(tangent)
-    return jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
+def _span(centre: jax.Array, half_axis: jax.Array, half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Between which t one coordinate of ``centre + t * half_axis`` is within the box."""
+    slope = jnp.where(jnp.abs(half_axis) > 1e-9, half_axis, 1e-9)
+    ends = (-half_size - centre) / slope, (half_size - centre) / slope
+    return jnp.minimum(*ends), jnp.maximum(*ends)
+
+
+def _go(start: Vector, t: jax.Array | float, way: Vector) -> Vector:
+    """start + t way."""
+    return [s + t * w for s, w in zip(start, way, strict=True)]
+
+
+def _dot(a: Vector, b: Vector) -> jax.Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _frame(x: jax.Array, y: jax.Array, z: jax.Array) -> jax.Array:
+    """MuJoCo's contact frame [..., 3, 3] about the normal (x, y, z)[...], with its choice of tangents."""
+    by_y = jnp.abs(y) < 0.5
+    along = jnp.where(by_y, y, z)
+    tangent = -x * along, jnp.where(by_y, 1.0, 0.0) - y * along, jnp.where(by_y, 0.0, 1.0) - z * along
+    length = jnp.sqrt(_dot(tangent, tangent))
+    a, b, c = (t / length for t in tangent)
+    rows = (x, y, z), (a, b, c), (y * c - z * b, z * a - x * c, x * b - y * a)
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _collide_plane_capsule(model: mjx.Model, data: mjx.Data, key: Any, geom: jax.Array) -> Contact:
@@ -149,41 +174,40 @@ def _collide_plane_capsule(model: mjx.Model, data: mjx.Data, key: Any, geom: jax
 
 def _collide_sphere_box(model: mjx.Model, data: mjx.Data, key: Any, geom: jax.Array) -> Contact:
     sphere, box = geom.T
-    return jax.vmap(
-        lambda centre, radius, pos, mat, size: _to_world(sphere_box(mat.T @ (centre - pos), radius, size), pos, mat)
-    )(
-        data.geom_xpos[sphere],
-        model.geom_size[sphere, 0],
-        data.geom_xpos[box],
-        data.geom_xmat[box],
-        model.geom_size[box],
-    )
+    turn, centre = _in_box(data, data.geom_xpos[sphere], box)
+    half_size = _components(model.geom_size[box])
+    return _to_world(data, box, turn, [sphere_box(centre, model.geom_size[sphere, 0], half_size)])
 
 
 def _collide_capsule_box(model: mjx.Model, data: mjx.Data, key: Any, geom: jax.Array) -> Contact:
     capsule, box = geom.T
-
-    def one(
-        centre: jax.Array, axis: jax.Array, size: jax.Array, pos: jax.Array, mat: jax.Array, half: jax.Array
-    ) -> Any:
-        local = capsule_box(mat.T @ (centre - pos), mat.T @ axis * size[1], size[0], half)
-        return jax.vmap(lambda contact: _to_world(contact, pos, mat))(local)
-
-    contacts = jax.vmap(one)(
-        data.geom_xpos[capsule],
-        data.geom_xmat[capsule][:, :, 2],
-        model.geom_size[capsule],
-        data.geom_xpos[box],
-        data.geom_xmat[box],
-        model.geom_size[box],
-    )
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), contacts)
+    turn, centre = _in_box(data, data.geom_xpos[capsule], box)
+    radius, half_length = model.geom_size[capsule, 0], model.geom_size[capsule, 1]
+    axis = _components(data.geom_xmat[capsule][:, :, 2])
+    half_axis = [half_length * _dot(column, axis) for column in zip(*turn, strict=True)]
+    return _to_world(data, box, turn, capsule_box(centre, half_axis, radius, _components(model.geom_size[box])))
 
 
-def _to_world(contact: Contact, pos: jax.Array, mat: jax.Array) -> Contact:
-    distance, position, frame = contact
-    normal = mat @ frame[0]
-    return distance, pos + mat @ position, _frame(normal)
+def _in_box(data: mjx.Data, points: jax.Array, box: jax.Array) -> tuple[list[Vector], Vector]:
+    """The rows of each box's rotation matrix, and each of ``points[P, 3]`` in its frame."""
+    turn = [_components(data.geom_xmat[box][:, row]) for row in range(3)]
+    offset = _components(points - data.geom_xpos[box])
+    return turn, [_dot(column, offset) for column in zip(*turn, strict=True)]
+
+
+def _components(vectors: jax.Array) -> Vector:
+    return vectors[..., 0], vectors[..., 1], vectors[..., 2]
+
+
+def _to_world(
+    data: mjx.Data, box: jax.Array, turn: list[Vector], found: list[tuple[jax.Array, Vector, Vector]]
+) -> Contact:
+    """Contacts in the boxes' frames, each a component [P] per array, as MJX has them: of one pair after the other."""
+    distance = jnp.stack([contact[0] for contact in found], axis=-1)
+    position = jnp.stack([jnp.stack([_dot(row, c[1]) for row in turn], axis=-1) for c in found], axis=-2)
+    position = position + data.geom_xpos[box][:, None]
+    frame = jnp.stack([_frame(*(_dot(row, contact[2]) for row in turn)) for contact in found], axis=-3)
+    return distance.reshape(-1), position.reshape(-1, 3), frame.reshape(-1, 3, 3)
 
 
 def _collider(function: Callable[..., Contact], contacts: int) -> Callable[..., Contact]:
@@ -193,8 +217,10 @@ def _collider(function: Callable[..., Contact], contacts: int) -> Callable[..., 
 
 _UPSTREAM_PLANE_CAPSULE = collision_driver._COLLISION_FUNC[mjx.GeomType.PLANE, mjx.GeomType.CAPSULE]
 
-_EXACT = {
+COLLIDERS = {
+    **collision_driver._COLLISION_FUNC,
     (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE): _collider(_collide_plane_capsule, 2),
     (mjx.GeomType.SPHERE, mjx.GeomType.BOX): _collider(_collide_sphere_box, 1),
     (mjx.GeomType.CAPSULE, mjx.GeomType.BOX): _collider(_collide_capsule_box, 2),
 }
+"""By the kinds of two geoms: (model, data, key, pairs int[P, 2]) -> contacts, ``ncon`` of them per pair."""

@@ -7,7 +7,7 @@ own, kept apart by collision bits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +16,21 @@ from mujoco import mjx
 
 from envs.maze import WALL_HALF_SIZE, Maze
 from envs.physics.base import PipelineState, Sensors
-from envs.physics.contacts import exact_contacts
+from envs.physics.constraints import Constraints
 from envs.physics.integrators import integrate
 from envs.physics.solver import solve
 from envs.physics.walls import cells_in_reach
 
+# Of mjx.forward: without its factorisation of M, its contacts and its solver.
+_STAGES = (
+    mjx.kinematics,
+    mjx.com_pos,
+    mjx.tendon,
+    mjx.crb,
+    mjx.transmission,
+    mjx.fwd_velocity,
+    mjx.fwd_actuation,
+)
 _SUNK = -10.0  # height of a box that stands for no wall: below the floor, out of reach
 
 
@@ -31,6 +41,7 @@ class MjxEngine:
         model: the bodies on an open floor, with mocap boxes for the walls around each, in the order of ``bodies``.
             All its constraints have to be one-sided (limits, pyramidal contacts), see ``envs.physics.solver``.
         layout: the maze.
+        most_contacts: by dimension, how many contacts are kept, the deepest ones.
         bodies: where in qpos the x of each body lies.
         frame_skip: sub-steps per control step.
         sensors: what to read after each control step, from the kinematics of the new state; None reads nothing.
@@ -45,6 +56,7 @@ class MjxEngine:
         self,
         model: mujoco.MjModel,
         layout: Maze,
+        most_contacts: Mapping[int, int],
         bodies: Sequence[int] = (0,),
         frame_skip: int = 5,
         sensors: Sensors | None = None,
@@ -59,6 +71,7 @@ class MjxEngine:
         self._sensors = sensors
         self._mjx_model = mjx.put_model(model, impl="jax")
         self._data = mjx.make_data(model, impl="jax")
+        self._constraints = Constraints(model, most_contacts)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
         """The state at (qpos[nq], qvel[nv]) without warm start."""
@@ -93,12 +106,12 @@ class MjxEngine:
     ) -> tuple[jax.Array, jax.Array]:
         """The constrained acceleration[nv] and the joint-space inertia[nv, nv]."""
         data = self._data.replace(qpos=qpos, qvel=qvel, ctrl=action, mocap_pos=walls)
-        with exact_contacts(), jax.default_matmul_precision("highest"):  # never TF32
-            for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+        with jax.default_matmul_precision("highest"):  # never TF32
+            for stage in _STAGES:
                 data = stage(self._mjx_model, data)
             mass = mjx.full_m(self._mjx_model, data)
-            efc = data._impl
-            return solve(mass, data.qacc_smooth, efc.efc_J, efc.efc_D, efc.efc_aref, warmstart), mass
+            force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+            return solve(mass, force, *self._constraints.rows(data), warmstart), mass
 
     def _sense(self, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
         """float[k]: what the body senses in this state."""

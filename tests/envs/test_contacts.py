@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +13,12 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
-from envs.physics.contacts import capsule_box, exact_contacts, plane_capsule_frame, sphere_box
+from envs.physics.contacts import COLLIDERS, plane_capsule_frame
 
-WALL = jnp.array([2.0, 2.0, 1.0])
 MARGIN = 0.02
 PLANE_CAPSULE = (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE)
 CAPSULE_BOX = (mjx.GeomType.CAPSULE, mjx.GeomType.BOX)
+SPHERE_BOX = (mjx.GeomType.SPHERE, mjx.GeomType.BOX)
 
 BODY_AT_WALL = """
 <mujoco><worldbody><geom type="box" size="2 2 1" margin=".01"/>
@@ -27,52 +29,65 @@ CAPSULE_ON_FLOOR = """
 <body><freejoint/><geom type="capsule" size=".08 .28" margin=".01"/></body></worldbody></mujoco>"""
 
 
-def contacts_in_c(model: mujoco.MjModel, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Contacts float[n, 7] (distance, position, normal), sorted, and the capsule's axis, in MuJoCo C."""
+def contacts_in_c(model: mujoco.MjModel, pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Contacts float[n, 7] (distance, position, normal), sorted, in MuJoCo C."""
     data = mujoco.MjData(model)
     data.qpos[:] = np.concatenate([pos, quat])
     mujoco.mj_forward(model, data)
     rows = [np.concatenate([[c.dist], c.pos, c.frame[:3]]) for c in (data.contact[k] for k in range(data.ncon))]
-    return np.array(sorted(map(tuple, rows))).reshape(-1, 7), data.geom_xmat[1].reshape(3, 3)[:, 2].copy()
+    return np.array(sorted(map(tuple, rows))).reshape(-1, 7)
 
 
-def our_contacts(distance: jax.Array, position: jax.Array, frame: jax.Array) -> np.ndarray:
-    rows = np.concatenate(
-        [np.atleast_1d(distance)[:, None], np.reshape(position, (-1, 3)), np.reshape(frame, (-1, 3, 3))[:, 0]], axis=1
-    )
-    return np.array(sorted(map(tuple, rows[rows[:, 0] < MARGIN]))).reshape(-1, 7)
+def our_contacts(model: mujoco.MjModel, kinds: tuple[Any, Any]) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Likewise, as a function of the body's position[3] and quaternion[4]: the body is the second geom."""
+    mjx_model = mjx.put_model(model, impl="jax")
+    start = mjx.make_data(model, impl="jax")
+
+    @jax.jit
+    def find(pos: jax.Array, quat: jax.Array) -> jax.Array:
+        data = mjx.kinematics(mjx_model, start.replace(qpos=jnp.concatenate([pos, quat])))
+        distance, position, frame = COLLIDERS[kinds](mjx_model, data, None, np.array([[1, 0]]))
+        return jnp.concatenate([distance[:, None], position, frame[:, 0]], axis=1)
+
+    def within_margin(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
+        rows = np.asarray(find(jnp.asarray(pos, jnp.float32), jnp.asarray(quat, jnp.float32)))
+        # C lists the box first, so that its normals point the other way when the body is the first of the pair
+        return np.array(sorted(map(tuple, rows[rows[:, 0] < MARGIN]))).reshape(-1, 7)
+
+    return within_margin
 
 
 def test_capsule_and_wall_equal_c() -> None:
     """Faces, seams and outer corners of a wall, the capsule's axis outside of it (deeper never happens)."""
-    length = 0.2828
-    model = mujoco.MjModel.from_xml_string(BODY_AT_WALL.format(type="capsule", size=f".08 {length}"))
-    find = jax.jit(lambda pos, axis: capsule_box(pos, axis * length, jnp.float32(0.08), WALL))
+    model = mujoco.MjModel.from_xml_string(BODY_AT_WALL.format(type="capsule", size=".08 .2828"))
+    find = our_contacts(model, CAPSULE_BOX)
     rng = np.random.default_rng(0)
     seen = {0: 0, 1: 0, 2: 0}
     while sum(seen.values()) < 800:
         pos = np.array([2 + rng.uniform(0, 0.4), rng.uniform(-2.3, 2.3), rng.uniform(-0.7, 0.0)]).astype(np.float32)
         quat = rng.normal(size=4)
-        expected, axis = contacts_in_c(model, pos, quat / np.linalg.norm(quat))
+        quat /= np.linalg.norm(quat)
+        expected = contacts_in_c(model, pos, quat)
         near_threshold = len(expected) and np.abs(expected[:, 0] - MARGIN).min() < 1e-5
         if near_threshold or (len(expected) and expected[0, 0] < -0.07):
             continue
-        ours = our_contacts(*find(pos, axis.astype(np.float32)))
-        assert len(ours) == len(expected), (pos, axis)
-        np.testing.assert_allclose(ours, expected, atol=2e-4, err_msg=f"{pos} {axis}")
+        ours = find(pos, quat)
+        assert len(ours) == len(expected), (pos, quat)
+        np.testing.assert_allclose(ours, expected, atol=2e-4, err_msg=f"{pos} {quat}")
         seen[len(expected)] += 1
     assert min(seen.values()) > 30
 
 
 def test_ball_and_wall_equal_c() -> None:
     model = mujoco.MjModel.from_xml_string(BODY_AT_WALL.format(type="sphere", size=".25"))
-    find = jax.jit(lambda pos: sphere_box(pos, jnp.float32(0.25), WALL))
+    find = our_contacts(model, SPHERE_BOX)
+    upright = np.array([1.0, 0, 0, 0])
     rng = np.random.default_rng(0)
     found = 0
     for _ in range(500):
         pos = np.array([2 + rng.uniform(-0.3, 0.4), rng.uniform(-2.3, 2.3), rng.uniform(-0.7, 0.0)]).astype(np.float32)
-        expected, _ = contacts_in_c(model, pos, np.array([1.0, 0, 0, 0]))
-        np.testing.assert_allclose(our_contacts(*find(pos)), expected, atol=1e-5, err_msg=str(pos))
+        expected = contacts_in_c(model, pos, upright)
+        np.testing.assert_allclose(find(pos, upright), expected, atol=1e-5, err_msg=str(pos))
         found += len(expected)
     assert found > 100
 
@@ -97,8 +112,7 @@ def test_floor_frame_equals_c_however_steep() -> None:
         expected, sizes, scene = capsule_on_floor(angle)
         frame = plane_capsule_frame(jnp.array([0.0, 0.0, 1.0]), scene.geom_xmat[1, :, 2])
         np.testing.assert_allclose(frame, expected, atol=1e-5)
-        with exact_contacts():
-            _, _, frames = collision_driver._COLLISION_FUNC[PLANE_CAPSULE](sizes, scene, None, jnp.array([[0, 1]]))
+        _, _, frames = COLLIDERS[PLANE_CAPSULE](sizes, scene, None, jnp.array([[0, 1]]))
         np.testing.assert_allclose(frames, [expected, expected], atol=1e-5)
 
 
@@ -107,10 +121,6 @@ def test_mjx_still_needs_the_mend() -> None:
     expected, sizes, scene = capsule_on_floor(20)
     _, _, frames = collision_driver._COLLISION_FUNC[PLANE_CAPSULE](sizes, scene, None, jnp.array([[0, 1]]))
     assert np.abs(np.asarray(frames[0]) - expected).max() > 0.1
-    upstream = collision_driver._COLLISION_FUNC[CAPSULE_BOX]
-    with exact_contacts():
-        assert collision_driver._COLLISION_FUNC[CAPSULE_BOX] is not upstream
-    assert collision_driver._COLLISION_FUNC[CAPSULE_BOX] is upstream
 
     model = mujoco.MjModel.from_xml_string(BODY_AT_WALL.format(type="sphere", size=".25"))
     data = mjx.make_data(model, impl="jax").replace(qpos=jnp.array([2.26, 0, 0, 1.0, 0, 0, 0]))
