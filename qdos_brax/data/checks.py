@@ -97,7 +97,8 @@ def _walls(rows: Rows, env: Any) -> list[str]:
         return []
     lines = []
     for index in env.body.places:
-        cells = env.layout.xy_to_ij(rows.qpos[:, index : index + 2])
+        with np.errstate(invalid="ignore"):  # of numbers too large for a cell, which is a wall then
+            cells = env.layout.xy_to_ij(rows.qpos[:, index : index + 2])
         inside = env.layout.grid[cells[:, 0], cells[:, 1]] == 1
         if inside.mean() > _IN_WALLS:
             what = "the body" if index == 0 else "the ball"
@@ -116,20 +117,28 @@ def _order(rows: Rows, env: Any) -> list[str]:
     step = 1 << 16  # bounds memory
     for start in range(0, len(inner), step):
         some = inner[start : start + step]
-        gaps[some] = np.abs(rows.next_observations[some] - rows.observations[some + 1]).max(axis=1) > SAME
+        gaps[some] = _apart(rows.next_observations[some], rows.observations[some + 1])
     if gaps.any():
         lines.append(f"next_observations are not the row that follows in {_rows(gaps)}: windows would cross episodes")
     if rows.qpos is None:
         return lines
     places = rows.observations[:, :2]
-    elsewhere = np.abs(places - rows.qpos[:, :2]).max(axis=1) > SAME
-    if elsewhere.any():
-        lines.append(f"qpos and observations disagree on where the body is in {_rows(elsewhere)}")
+    differ = _apart(rows.observations[:, :2], rows.qpos[:, :2])
+    if rows.qvel is not None and env.observation_size == env.engine.nq + env.engine.nv:  # it is the whole state
+        differ |= _apart(rows.observations, np.concatenate([rows.qpos, rows.qvel], axis=1))
+    if differ.any():
+        lines.append(f"qpos, qvel and observations disagree on the state in {_rows(differ)}")
     if env.layout.teleporters is None:
         jumps = np.linalg.norm(rows.next_observations[:, :2] - places, axis=1) > JUMP
         if jumps.any():
             lines.append(f"the body moves more than {JUMP} in one step in {_rows(jumps)}: ends out of step?")
     return lines
+
+
+def _apart(some: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """bool[N], rows that are not the same."""
+    with np.errstate(over="ignore"):
+        return np.abs(some - other).max(axis=1) > SAME
 
 
 def _compare_rewards(rows: Rows, env: Any, attributes: Mapping[str, Any], found: Findings) -> None:

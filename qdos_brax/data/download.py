@@ -27,7 +27,7 @@ from qdos_brax.errors import UserError
 from qdos_brax.runs.folder import write_text
 from qdos_brax.runs.progress import Progress
 
-_PIECE = 1 << 20  # bytes per read, and per step of the progress bar
+_PIECE = 1 << 20  # bytes per step of the progress bar, and at most per read
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,9 @@ def _connect(request: urllib.request.Request, partial: Path, stall: float) -> An
 
 
 def _receive(response: Any) -> bytes:
-    """The next piece of the body; empty at its end."""
+    """What has come of the body since (a stall must not lose it); empty at its end."""
     try:
-        return bytes(response.read(_PIECE))
+        return bytes(response.read1(_PIECE))
     except (OSError, http.client.HTTPException) as error:
         raise _NotThisTime(f"the connection broke off, {_reason(error)}") from None
 
@@ -174,12 +174,13 @@ def _begin(response: Any, done: int, state: dict[str, Any]) -> tuple[int, int | 
 def _copy(response: Any, file: Any, done: int, total: int | None, name: str) -> None:
     """Appends the body; raises _NotThisTime when it ends before ``total`` bytes are there."""
     pieces = -(-total // _PIECE) if total else 0
-    with Progress(f"fetch {name}", max(1, pieces), done // _PIECE, waiting_for="connected") as progress:
-        began, first = time.monotonic(), done
+    first, shown, began = done, done // _PIECE, time.monotonic()
+    with Progress(f"fetch {name}", max(1, pieces), shown, waiting_for="connected") as progress:
         while piece := _receive(response):
             file.write(piece)
             done += len(piece)
-            if pieces:
+            while pieces and shown < (pieces if done == total else done // _PIECE):
+                shown += 1
                 progress.advance((done - first) / 1e6 / max(1e-3, time.monotonic() - began), "MB", float("nan"))
     file.truncate()
     if total is not None and done < total:

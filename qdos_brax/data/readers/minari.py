@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -62,8 +62,10 @@ def load(path: Path) -> Rows:
             terminals=np.empty(total, np.float32),
             rewards=np.empty(total, np.float32),
         )
-        has_states = all(f"infos/{key}" in episodes[0] for key in ("qpos", "qvel"))
-        if has_states:
+        with_states = sum("infos/qpos" in group and "infos/qvel" in group for group in episodes)
+        if with_states not in (0, len(episodes)):
+            raise UserError(f"{path}: only {with_states} of {len(episodes)} episodes have infos/qpos and infos/qvel")
+        if with_states:
             rows.qpos, rows.qvel = (
                 np.empty((total, *_set(episodes[0], f"infos/{key}").shape[1:]), np.float32) for key in ("qpos", "qvel")
             )
@@ -115,13 +117,13 @@ def _fill(path: Path, group: h5py.Group, rows: Rows, part: slice) -> None:
             f"{(length + 1, rows.observations.shape[1])} are expected: the file is damaged"
         )
     rows.observations[part], rows.next_observations[part] = observations[:-1], observations[1:]
-    rows.actions[part] = _numeric(_set(group, "actions"))
+    rows.actions[part] = _numbers(group, "actions")
     assert rows.rewards is not None and rows.terminals is not None
-    rows.rewards[part] = _numeric(_set(group, "rewards")).reshape(-1)
-    rows.terminals[part] = _numeric(_set(group, "terminations")).reshape(-1) != 0
+    rows.rewards[part] = _numbers(group, "rewards").reshape(-1)
+    rows.terminals[part] = _numbers(group, "terminations").reshape(-1) != 0
     for key, target in (("qpos", rows.qpos), ("qvel", rows.qvel)):
         if target is not None:
-            values = _numeric(_set(group, f"infos/{key}"))
+            values = _numbers(group, f"infos/{key}")
             if len(values) not in (length, length + 1):
                 raise UserError(f"{path}: {group.name[1:]} has {len(values)} rows of infos/{key}: the file is damaged")
             target[part] = values[:length]  # one more in today's files, where reset's info comes first
@@ -130,37 +132,40 @@ def _fill(path: Path, group: h5py.Group, rows: Rows, part: slice) -> None:
 def _observations(group: h5py.Group) -> np.ndarray:
     """[T + 1, obs] of an episode."""
     item = group["observations"]
-    if isinstance(item, h5py.Dataset):
-        return _flat(item)
+    if not isinstance(item, h5py.Group):
+        return _flat(group, "observations")
     if not set(item) >= _GOAL_KEYS:
-        return np.concatenate([_flat(leaf) for leaf in _leaves(item)], axis=1)
-    observation, achieved = _flat(_set(item, "observation")), item["achieved_goal"]
-    if isinstance(achieved, h5py.Group):
+        return np.concatenate([_flat(parent, key) for parent, key in _leaves(item)], axis=1)
+    observation = _flat(item, "observation")
+    if isinstance(item["achieved_goal"], h5py.Group):
         return observation  # the kitchen's: parts of the observation again
-    position = _flat(achieved)
+    position = _flat(item, "achieved_goal")
     if np.array_equal(observation[:, : position.shape[1]], position):
         return observation
     return np.concatenate([position, observation], axis=1)
 
 
-def _leaves(group: h5py.Group) -> Sequence[h5py.Dataset]:
-    """All data sets below ``group``, by name; parts of a tuple by number."""
-    keys = sorted(group, key=lambda key: (int(key[7:]), "") if re.fullmatch(r"_index_\d+", key) else (0, key))
-    return [
-        leaf for key in keys for leaf in (_leaves(group[key]) if isinstance(group[key], h5py.Group) else [group[key]])
-    ]
+def _leaves(group: h5py.Group) -> Iterator[tuple[h5py.Group, str]]:
+    """Group and name of all data sets below ``group``, by name; parts of a tuple by number."""
+    for key in sorted(group, key=lambda key: (int(key[7:]), "") if re.fullmatch(r"_index_\d+", key) else (0, key)):
+        if isinstance(group[key], h5py.Group):
+            yield from _leaves(group[key])
+        else:
+            yield group, key
 
 
-def _flat(values: h5py.Dataset) -> np.ndarray:
+def _flat(group: h5py.Group, key: str) -> np.ndarray:
     """[T, numbers per row]."""
-    array = _numeric(values)
+    array = _numbers(group, key)
     return array.reshape(len(array), -1)
 
 
-def _numeric(values: h5py.Dataset) -> np.ndarray:
+def _numbers(group: h5py.Group, key: str) -> np.ndarray:
+    """A data set as float32."""
+    values = _set(group, key)
     if values.dtype.kind not in NUMERIC or not values.shape:
         raise TypeError(f"{values.name[1:]!r} is not numeric ({values.dtype})")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite then, and reported as such
         return np.asarray(values[()]).astype(np.float32, copy=False)
 
 
