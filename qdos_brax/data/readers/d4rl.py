@@ -31,19 +31,20 @@ def load(path: Path) -> Rows:
         terminals = table.column("terminals") != 0
         marked = table.column("timeouts") != 0 if "timeouts" in table else terminals.copy()
         notes: list[str] = []
+        keep = None
+        (observations,) = table.floats("observations", None)
         if "next_observations" in table:
-            keep = None
-            (observations,), (following,) = table.floats("observations", None), table.floats("next_observations", None)
+            (following,) = table.floats("next_observations", None)
             breaks = _breaks(observations, following)
         else:
-            breaks = _jumps(table)
+            breaks = _jumps(observations) if "infos/qpos" in table else np.zeros(len(observations), bool)
         ends = marked | breaks
         if len(ends):
             ends[-1] = True
             _note_breaks(notes, marked, breaks)
         if "next_observations" not in table:
             keep, is_next = ~ends, np.roll(~ends, 1)
-            observations, following = table.floats("observations", keep, is_next)
+            observations, following = observations[keep], observations[is_next]
             ends = np.roll(ends, -1)[keep]
         rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes)
         rows.terminals = terminals.astype(np.float32) if keep is None else terminals[keep].astype(np.float32)
@@ -69,16 +70,14 @@ def _breaks(observations: np.ndarray, following: np.ndarray) -> np.ndarray:
     return breaks
 
 
-def _jumps(table: HDF5Table) -> np.ndarray:
-    """bool[N]: the body is somewhere else in the next row; none where it is no body with a simulator state.
+def _jumps(observations: np.ndarray) -> np.ndarray:
+    """bool[N]: the body is somewhere else in the next row.
 
-    Its place is taken from the observation, for D4RL's ant mazes store ``infos/qpos`` after the action.
+    Every body's observation begins with its place. ``infos/qpos`` would not do: D4RL stores it after the action.
     """
-    num_rows = table.shapes["observations"][0]
-    jumps = np.zeros(num_rows, bool)
-    if "infos/qpos" in table and len(table.shapes["observations"]) == 2 and num_rows:
-        xy = np.concatenate([block[:, :2] for block in table.blocks("observations")])
-        jumps[:-1] = np.linalg.norm(np.diff(xy, axis=0), axis=1) > JUMP
+    jumps = np.zeros(len(observations), bool)
+    if observations.ndim == 2:  # else the sizes are reported by the checks
+        jumps[:-1] = np.linalg.norm(np.diff(observations[:, :2], axis=0), axis=1) > JUMP
     return jumps
 
 

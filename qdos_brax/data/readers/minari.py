@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -15,6 +16,8 @@ from qdos_brax.data.readers.table import NUMERIC
 from qdos_brax.errors import UserError
 
 _MAIN_FILE = "main_data.hdf5"
+_REQUIRED = ("observations", "actions", "rewards", "terminations", "truncations")
+_STATES = {"infos/qpos", "infos/qvel"}
 _GOAL_KEYS = {"observation", "achieved_goal", "desired_goal"}
 
 
@@ -47,37 +50,34 @@ def load(path: Path) -> Rows:
         UserError: unreadable, an episode missing or incomplete, or sizes that do not fit.
     """
     with unreadable(path), h5py.File(path, "r") as file:
-        episodes = _episodes(path, file)
-        lengths = [_length(path, group) for group in episodes]
-        stops = np.cumsum(lengths)
-        total = int(stops[-1]) if lengths else 0
+        names = _episode_names(path, file)
+        stops = np.cumsum([_set(file[f"{name}/actions"]).shape[0] for name in names])
+        total = int(stops[-1]) if names else 0
         if not total:
             raise UserError(f"{path}: no transitions")
-        first = _observations(episodes[0])
+        first = _open(path, file, names[0])
+        width = _observations(first["observations"]).shape[1]
         rows = Rows(
-            observations=np.empty((total, first.shape[1]), np.float32),
-            actions=np.empty((total, *_set(episodes[0], "actions").shape[1:]), np.float32),
-            next_observations=np.empty((total, first.shape[1]), np.float32),
+            observations=np.empty((total, width), np.float32),
+            actions=np.empty((total, *first["actions"].shape[1:]), np.float32),
+            next_observations=np.empty((total, width), np.float32),
             ends=np.zeros(total, bool),
             terminals=np.empty(total, np.float32),
             rewards=np.empty(total, np.float32),
         )
-        with_states = sum("infos/qpos" in group and "infos/qvel" in group for group in episodes)
-        if with_states not in (0, len(episodes)):
-            raise UserError(f"{path}: only {with_states} of {len(episodes)} episodes have infos/qpos and infos/qvel")
-        if with_states:
-            rows.qpos, rows.qvel = (
-                np.empty((total, *_set(episodes[0], f"infos/{key}").shape[1:]), np.float32) for key in ("qpos", "qvel")
-            )
+        if set(first) >= _STATES:
+            rows.qpos = np.empty((total, *first["infos/qpos"].shape[1:]), np.float32)
+            rows.qvel = np.empty((total, *first["infos/qvel"].shape[1:]), np.float32)
         rows.ends[stops - 1] = True
-        for group, length, stop in zip(episodes, lengths, stops, strict=True):
-            _fill(path, group, rows, slice(int(stop) - length, int(stop)))
+        for name, start, stop in zip(names, [0, *stops], stops, strict=False):
+            # One episode's data sets are open at a time, for each has a cache of its own.
+            _fill(path, name, _open(path, file, name), rows, slice(int(start), int(stop)))
         after_action(path, rows)
         return rows
 
 
-def _episodes(path: Path, file: h5py.File) -> list[h5py.Group]:
-    """The groups of all episodes in order; checks them against the metadata."""
+def _episode_names(path: Path, file: h5py.File) -> list[str]:
+    """The names of all episodes in order; checks them against the metadata."""
     numbers = sorted(int(match[1]) for key in file if (match := re.fullmatch(r"episode_(\d+)", key)))
     expected = len(numbers)
     metadata_path = path.with_name("metadata.json")
@@ -89,88 +89,92 @@ def _episodes(path: Path, file: h5py.File) -> list[h5py.Group]:
     missing = sorted(set(range(max(expected, numbers[-1] + 1 if numbers else 0))) - set(numbers))
     if missing:
         raise UserError(f"{path}: episode_{missing[0]} is missing ({len(numbers)} of {expected} are there)")
-    return [file[f"episode_{number}"] for number in numbers]
+    return [f"episode_{number}" for number in numbers]
 
 
-def _length(path: Path, group: h5py.Group) -> int:
-    """Transitions in an episode, after a look at the sizes of everything in it."""
-    for key in ("observations", "actions", "rewards", "terminations", "truncations"):
-        if key not in group:
-            raise UserError(f"{path}: {group.name[1:]} has no {key!r}; the file is damaged or of another version")
-    length = _set(group, "actions").shape[0]
-    for key in ("rewards", "terminations", "truncations"):
-        shape = _set(group, key).shape
-        if shape not in ((length,), (length, 1)):
-            raise UserError(f"{path}: {group.name[1:]} has {length} actions and {key} of shape {shape}: it is damaged")
-    if group.attrs.get("total_steps", length) != length:
-        steps = group.attrs["total_steps"]
-        raise UserError(f"{path}: {group.name[1:]} has {length} of its {steps} steps: the file is damaged")
-    return int(length)
+def _open(path: Path, file: h5py.File, name: str) -> dict[str, Any]:
+    """What an episode holds; ``observations`` may be a group."""
+    group, items = file[name], {}
+    for key in (*_REQUIRED, *_STATES):
+        try:
+            items[key] = group[key]
+        except KeyError:
+            if key in _REQUIRED:
+                raise UserError(f"{path}: {name} has no {key!r}: damaged, or of another version") from None
+    steps = group.attrs.get("total_steps")
+    if steps is not None and steps != (length := _set(items["actions"]).shape[0]):
+        raise UserError(f"{path}: {name} has {length} of its {steps} steps: the file is damaged")
+    return items
 
 
-def _fill(path: Path, group: h5py.Group, rows: Rows, part: slice) -> None:
+def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: slice) -> None:
+    """Reads an episode into its ``part`` of ``rows``, after a look at the sizes."""
     length = part.stop - part.start
-    observations = _observations(group)
-    if observations.shape != (length + 1, rows.observations.shape[1]):
+    for key in ("rewards", "terminations", "truncations"):
+        shape = _set(items[key]).shape
+        if shape not in ((length,), (length, 1)):
+            raise UserError(f"{path}: {name} has {length} actions and {key} of shape {shape}: the file is damaged")
+    if (set(items) >= _STATES) != (rows.qpos is not None):
+        raise UserError(f"{path}: {name} and the first episode differ in having infos/qpos and infos/qvel")
+    observations, expected = _observations(items["observations"]), (length + 1, rows.observations.shape[1])
+    if observations.shape != expected:
         raise UserError(
-            f"{path}: {group.name[1:]} has observations {observations.shape} where "
-            f"{(length + 1, rows.observations.shape[1])} are expected: the file is damaged"
+            f"{path}: {name} has observations {observations.shape} where {expected} are expected: the file is damaged"
         )
     rows.observations[part], rows.next_observations[part] = observations[:-1], observations[1:]
-    rows.actions[part] = _numbers(group, "actions")
+    rows.actions[part] = _numbers(items["actions"])
     assert rows.rewards is not None and rows.terminals is not None
-    rows.rewards[part] = _numbers(group, "rewards").reshape(-1)
-    rows.terminals[part] = _numbers(group, "terminations").reshape(-1) != 0
-    for key, target in (("qpos", rows.qpos), ("qvel", rows.qvel)):
+    rows.rewards[part] = _numbers(items["rewards"]).reshape(-1)
+    rows.terminals[part] = _numbers(items["terminations"]).reshape(-1) != 0
+    for key, target in (("infos/qpos", rows.qpos), ("infos/qvel", rows.qvel)):
         if target is not None:
-            values = _numbers(group, f"infos/{key}")
+            values = _numbers(items[key])
             if len(values) not in (length, length + 1):
-                raise UserError(f"{path}: {group.name[1:]} has {len(values)} rows of infos/{key}: the file is damaged")
+                raise UserError(f"{path}: {name} has {len(values)} rows of {key}: the file is damaged")
             target[part] = values[:length]  # one more in today's files, where reset's info comes first
 
 
-def _observations(group: h5py.Group) -> np.ndarray:
-    """[T + 1, obs] of an episode."""
-    item = group["observations"]
+def _observations(item: Any) -> np.ndarray:
+    """[T + 1, obs] of an episode, from its ``observations``."""
     if not isinstance(item, h5py.Group):
-        return _flat(group, "observations")
+        return _flat(item)
     if not set(item) >= _GOAL_KEYS:
-        return np.concatenate([_flat(parent, key) for parent, key in _leaves(item)], axis=1)
-    observation = _flat(item, "observation")
-    if isinstance(item["achieved_goal"], h5py.Group):
+        return np.concatenate([_flat(leaf) for leaf in _leaves(item)], axis=1)
+    observation, achieved = _flat(item["observation"]), item["achieved_goal"]
+    if isinstance(achieved, h5py.Group):
         return observation  # the kitchen's: parts of the observation again
-    position = _flat(item, "achieved_goal")
+    position = _flat(achieved)
     if np.array_equal(observation[:, : position.shape[1]], position):
         return observation
     return np.concatenate([position, observation], axis=1)
 
 
-def _leaves(group: h5py.Group) -> Iterator[tuple[h5py.Group, str]]:
-    """Group and name of all data sets below ``group``, by name; parts of a tuple by number."""
+def _leaves(group: h5py.Group) -> Iterator[Any]:
+    """All that is no group below ``group``, by name; parts of a tuple by number."""
     for key in sorted(group, key=lambda key: (int(key[7:]), "") if re.fullmatch(r"_index_\d+", key) else (0, key)):
-        if isinstance(group[key], h5py.Group):
-            yield from _leaves(group[key])
+        item = group[key]
+        if isinstance(item, h5py.Group):
+            yield from _leaves(item)
         else:
-            yield group, key
+            yield item
 
 
-def _flat(group: h5py.Group, key: str) -> np.ndarray:
+def _flat(item: Any) -> np.ndarray:
     """[T, numbers per row]."""
-    array = _numbers(group, key)
+    array = _numbers(item)
     return array.reshape(len(array), -1)
 
 
-def _numbers(group: h5py.Group, key: str) -> np.ndarray:
+def _numbers(item: Any) -> np.ndarray:
     """A data set as float32."""
-    values = _set(group, key)
+    values = _set(item)
     if values.dtype.kind not in NUMERIC or not values.shape:
         raise TypeError(f"{values.name[1:]!r} is not numeric ({values.dtype})")
     with np.errstate(over="ignore", invalid="ignore"):  # infinite then, and reported as such
         return np.asarray(values[()]).astype(np.float32, copy=False)
 
 
-def _set(group: h5py.Group, key: str) -> h5py.Dataset:
-    item = group[key]
+def _set(item: Any) -> h5py.Dataset:
     if not isinstance(item, h5py.Dataset) or item.shape is None:
-        raise TypeError(f"{item.name[1:]!r} holds no values")
+        raise TypeError(f"{item.name!r} holds no values")
     return item
