@@ -93,12 +93,11 @@ def _sizes(rows: Rows, env: Any) -> list[str]:
 
 def _walls(rows: Rows, env: Any) -> list[str]:
     """A position inside a wall: the data is another maze's, or has another origin (as Minari's ant mazes)."""
-    if rows.qpos is None:
-        return []
+    states = rows.observations if rows.qpos is None else rows.qpos  # both have body and ball at the same places
     lines = []
     for index in env.body.places:
         with np.errstate(invalid="ignore"):  # of numbers too large for a cell, which is a wall then
-            cells = env.layout.xy_to_ij(rows.qpos[:, index : index + 2])
+            cells = env.layout.xy_to_ij(states[:, index : index + 2])
         inside = env.layout.grid[cells[:, 0], cells[:, 1]] == 1
         if inside.mean() > _IN_WALLS:
             what = "the body" if index == 0 else "the ball"

@@ -121,8 +121,12 @@ def test_training_refuses_another_mazes_data(tmp_path: Path) -> None:
     columns = {"observations": rows.observations, "actions": rows.actions, "terminals": rows.ends}
     formats.write_hdf5(path, columns | {"infos/qpos": rows.qpos, "infos/qvel": rows.qvel}, {})
     assert formats.read(path, envs.make("antmaze-large", physics="mujoco")).size == 117
+    medium = envs.make("antmaze-medium", physics="mujoco")
     with pytest.raises(UserError, match="inside the walls of antmaze-medium"):
-        formats.read(path, envs.make("antmaze-medium", physics="mujoco"))
+        formats.read(path, medium)
+    formats.write_hdf5(path, columns | {"rewards": np.zeros(120, np.float32)}, {})
+    with pytest.raises(UserError, match="inside the walls of antmaze-medium"):  # seen without states as well
+        formats.read(path, medium)
 
 
 def test_command_draws_the_map_and_ends_with_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -51,7 +51,7 @@ def load(path: Path) -> Rows:
     """
     with unreadable(path), h5py.File(path, "r") as file:
         names = _episode_names(path, file)
-        stops = np.cumsum([_set(file[f"{name}/actions"]).shape[0] for name in names])
+        stops = np.cumsum([_set(_item(file, f"{name}/actions")).shape[0] for name in names])
         total = int(stops[-1]) if names else 0
         if not total:
             raise UserError(f"{path}: no transitions")
@@ -97,7 +97,7 @@ def _open(path: Path, file: h5py.File, name: str) -> dict[str, Any]:
     group, items = file[name], {}
     for key in (*_REQUIRED, *_STATES):
         try:
-            items[key] = group[key]
+            items[key] = _item(group, key)
         except KeyError:
             if key in _REQUIRED:
                 raise UserError(f"{path}: {name} has no {key!r}: damaged, or of another version") from None
@@ -136,12 +136,13 @@ def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: sli
 
 def _observations(item: Any) -> np.ndarray:
     """[T + 1, obs] of an episode, from its ``observations``."""
-    if not isinstance(item, h5py.Group):
+    if not isinstance(item, h5py.h5g.GroupID):
         return _flat(item)
-    if not set(item) >= _GOAL_KEYS:
-        return np.concatenate([_flat(leaf) for leaf in _leaves(item)], axis=1)
-    observation, achieved = _flat(item["observation"]), item["achieved_goal"]
-    if isinstance(achieved, h5py.Group):
+    group = h5py.Group(item)
+    if not set(group) >= _GOAL_KEYS:
+        return np.concatenate([_flat(leaf) for leaf in _leaves(group)], axis=1)
+    observation, achieved = _flat(_item(group, "observation")), _item(group, "achieved_goal")
+    if isinstance(achieved, h5py.h5g.GroupID):
         return observation  # the kitchen's: parts of the observation again
     position = _flat(achieved)
     if np.array_equal(observation[:, : position.shape[1]], position):
@@ -152,11 +153,16 @@ def _observations(item: Any) -> np.ndarray:
 def _leaves(group: h5py.Group) -> Iterator[Any]:
     """All that is no group below ``group``, by name; parts of a tuple by number."""
     for key in sorted(group, key=lambda key: (int(key[7:]), "") if re.fullmatch(r"_index_\d+", key) else (0, key)):
-        item = group[key]
-        if isinstance(item, h5py.Group):
-            yield from _leaves(item)
+        item = _item(group, key)
+        if isinstance(item, h5py.h5g.GroupID):
+            yield from _leaves(h5py.Group(item))
         else:
             yield item
+
+
+def _item(group: h5py.Group, key: str) -> Any:
+    """What is under ``key``; HDF5's own handle, for h5py's objects take twice the time, and there are thousands."""
+    return h5py.h5o.open(group.id, key.encode())
 
 
 def _flat(item: Any) -> np.ndarray:
@@ -168,13 +174,18 @@ def _flat(item: Any) -> np.ndarray:
 def _numbers(item: Any) -> np.ndarray:
     """A data set as float32."""
     values = _set(item)
-    if values.dtype.kind not in NUMERIC or not values.shape:
-        raise TypeError(f"{values.name[1:]!r} is not numeric ({values.dtype})")
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite then, and reported as such
-        return np.asarray(values[()]).astype(np.float32, copy=False)
+    if values.dtype.kind not in NUMERIC:
+        raise TypeError(f"{_name(item)} is not numeric ({values.dtype})")
+    out = np.empty(values.shape, bool if values.dtype.kind == "b" else np.float32)
+    values.read(h5py.h5s.ALL, h5py.h5s.ALL, out)
+    return out.astype(np.float32, copy=False)
 
 
-def _set(item: Any) -> h5py.Dataset:
-    if not isinstance(item, h5py.Dataset) or item.shape is None:
-        raise TypeError(f"{item.name!r} holds no values")
+def _set(item: Any) -> h5py.h5d.DatasetID:
+    if not isinstance(item, h5py.h5d.DatasetID) or not item.shape:
+        raise TypeError(f"{_name(item)} holds no rows")
     return item
+
+
+def _name(item: Any) -> str:
+    return repr(h5py.h5i.get_name(item).decode(errors="replace"))
