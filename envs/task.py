@@ -15,11 +15,16 @@ from envs.families import Cell, TaskSpec
 from envs.maze import Maze
 from envs.physics.base import Engine, PipelineState
 
-__all__ = ["GOAL_TOLERANCE", "RESET_NOISE", "START_NOISE", "TaskEnv", "TaskSpec"]
+__all__ = ["GOAL_TOLERANCE", "RESET_NOISE", "START_NOISE", "TaskEnv", "TaskSpec", "labels"]
 
 GOAL_TOLERANCE = 0.5
 START_NOISE = 1.0  # half width of the uniform noise on start positions
 RESET_NOISE = 0.1  # half width of the uniform noise on qpos, standard deviation of the normal noise on qvel
+
+
+def labels(success: Any) -> tuple[Any, Any]:
+    """(reward, mask) of a state before the action, from ``success[...]`` (0.0 or 1.0): online and for data alike."""
+    return success - 1.0, 1.0 - success
 
 
 class TaskEnv(Env):
@@ -150,7 +155,7 @@ class TaskEnv(Env):
         return state.replace(
             pipeline_state=pipeline_state,
             obs=obs,
-            reward=success - 1.0,
+            reward=labels(success)[0],
             done=jnp.maximum(success, capped),
             metrics=state.metrics | {"success": success},
             info=info,

@@ -65,7 +65,10 @@ def train_parser() -> Parser:
         "--resume", metavar="DIR", help="go on with the run in DIR, exactly where it was; takes no other flag"
     )
     parser.add_argument(
-        "--dataset", metavar="FILE", help="OGBench .npz or D4RL .hdf5 (default: the task's own set, collected once)"
+        "--dataset",
+        metavar="FILE",
+        help="OGBench .npz, D4RL .hdf5, Minari folder, or a name such as antmaze-large-navigate-v0, which is fetched "
+        "(default: the task's own set, collected once)",
     )
     parser.add_argument(
         "--physics",

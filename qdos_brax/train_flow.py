@@ -18,7 +18,7 @@ import jax
 import envs
 from qdos_brax import config as configs
 from qdos_brax.config import Config
-from qdos_brax.data import cache, formats
+from qdos_brax.data import cache, download, formats
 from qdos_brax.errors import UserError
 from qdos_brax.methods import METHODS
 from qdos_brax.methods.build import build_phases
@@ -55,8 +55,8 @@ def start(make_config: Callable[[], Config], preset_given: bool, started: float)
     prepare_jax()
     asked = make_config()
     _check_method(asked.method)
-    if asked.dataset and not Path(asked.dataset).expanduser().exists():
-        raise UserError(f"{asked.dataset}: no such file")
+    if asked.dataset:
+        download.check(asked.dataset)
     env = _make_env(asked)
     resolved = configs.replace(asked, env=env.spec.full_name, physics=env.backend)
     folder = RunFolder.create(asked.out or new_path(asked.run.root, f"{resolved.env}-{resolved.method}"))
@@ -94,7 +94,7 @@ def resume(path: str, started: float) -> dict[str, Any]:
 
 def _run(config: Config, env: Any, folder: RunFolder, started: float) -> dict[str, Any]:
     before_data = time.perf_counter()
-    data_path = Path(config.dataset).expanduser() if config.dataset else _default_data(config, env)
+    data_path = formats.data_file(download.resolve(config.dataset) if config.dataset else _default_data(config, env))
     print(f"data      {data_path}", flush=True)
     dataset = formats.read(data_path, env)
     _same_data(folder, data_path)

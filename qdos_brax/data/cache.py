@@ -52,7 +52,7 @@ def default_dataset(
     path = folder() / f"{collect.data_name(env)}-{parameters}-{version}.hdf5"
     if path.exists():
         return path
-    with _locked(path):
+    with locked(path):
         if not path.exists():  # another process may have made it while this one waited
             print(f"no data for {collect.data_name(env)} yet: collecting {transitions:,} steps into {path}", flush=True)
             make_file(path, env, transitions, degraded_share, noise, seed, num_envs, policy)
@@ -88,7 +88,7 @@ def make_file(
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Holds the lock of ``path``; the system releases it when the process ends, however it ends."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 import envs
-from qdos_brax.data import cache, formats
+from qdos_brax.data import cache, checks, download, formats, sources
 from qdos_brax.data.dataset import episode_bounds
+from qdos_brax.data.labelling import label
 from qdos_brax.data.quality import QUALITY
+from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
 
 _UNUSABLE = 2  # exit code, as for every error that is the user's to mend
@@ -39,14 +41,22 @@ def add_parser(commands: Any) -> None:
     )
     make.set_defaults(run=_make)
 
+    fetch = actions.add_parser("fetch", help="fetch a public set by name, or check one that was fetched")
+    fetch.add_argument("names", metavar="NAME", nargs="+", help=f"such as {sources.examples()}")
+    fetch.set_defaults(run=_fetch)
+
+    what = "an OGBench .npz, a D4RL .hdf5, a Minari folder, or the name of a public set"
     info = actions.add_parser("info", help="what is in a data file")
-    info.add_argument("file", metavar="FILE", help="an OGBench .npz or a D4RL .hdf5 file")
+    info.add_argument("file", metavar="FILE", help=what)
+    info.add_argument("--env", metavar="TASK", help="the task for --map (default: the one the file was made for)")
+    info.add_argument("--map", metavar="FILE", help="also draw where the data has been, as .png")
     info.set_defaults(run=_info)
 
     check = actions.add_parser("check", help="whether a data file fits a task; exit code 2 if not")
-    check.add_argument("file", metavar="FILE", help="an OGBench .npz or a D4RL .hdf5 file")
+    check.add_argument("file", metavar="FILE", help=what)
     check.add_argument("--env", metavar="TASK", required=True, help="the task it shall be used for")
     check.add_argument("--horizon", metavar="H", type=int, default=20, help="steps of a segment (default 20)")
+    check.add_argument("--map", metavar="FILE", help="also draw where the data has been, as .png")
     check.set_defaults(run=_check)
 
 
@@ -63,48 +73,80 @@ def _make(args: argparse.Namespace) -> int:
     return 0
 
 
-def _info(args: argparse.Namespace) -> int:
-    arrays = formats.read_arrays(args.file)
-    for name, value in formats.read_attrs(args.file).items():
-        print(f"{name:18s} {value}")
-    for name, value in arrays.items():
-        print(f"{name:18s} {value.dtype} {'x'.join(map(str, value.shape))}")
-    bounds = episode_bounds(arrays["ends"])
-    if len(bounds) == 0:
-        print(f"{'transitions':18s} 0")
-        return 0
-    lengths = bounds[:, 1] - bounds[:, 0]
-    print(f"{'transitions':18s} {len(arrays['ends']):,}")
-    print(f"{'episodes':18s} {len(lengths):,} of {lengths.min()} to {lengths.max()} steps")
-    print(f"{'largest action':18s} {np.abs(arrays['actions']).max():.4g}")
-    if "quality" in arrays:
-        shares = ", ".join(f"{name} {np.mean(arrays['quality'] == code):.1%}" for name, code in QUALITY.items())
-        print(f"{'behaviour':18s} {shares}")
+def _fetch(args: argparse.Namespace) -> int:
+    for name in args.names:
+        if sources.find(name) is None:
+            raise UserError(f"there is no public data set {name!r}; there are such as {sources.examples()}")
+    for name in args.names:
+        print(download.resolve(name))
     return 0
+
+
+def _info(args: argparse.Namespace) -> int:
+    path = download.resolve(args.file)
+    rows, attributes = formats.load(path), formats.read_attrs(path)
+    for name, value in attributes.items():
+        print(f"{name:18s} {value}")
+    for name, array in rows.arrays().items():
+        print(f"{name:18s} {array.dtype} {'x'.join(map(str, array.shape))}")
+    print(f"{'transitions':18s} {rows.size:,}")
+    if rows.size:
+        _describe(rows)
+    for line in rows.notes:
+        print(f"note: {line}")
+    if args.map:
+        task = args.env or attributes.get("env")
+        if not task:
+            raise UserError(f"{path} does not say which task it was made for; name it with --env")
+        _draw_map(args.map, rows, _env(str(task), "mujoco"), path.name)
+    return 0
+
+
+def _describe(rows: Rows) -> None:
+    """Episodes, returns, actions and behaviour of a set that is not empty."""
+    bounds = episode_bounds(rows.ends)
+    lengths = bounds[:, 1] - bounds[:, 0]
+    print(f"{'episodes':18s} {len(lengths):,} of {lengths.min()} to {lengths.max()} steps")
+    if rows.rewards is not None:
+        returns = np.add.reduceat(rows.rewards, bounds[:, 0])
+        spread = f"{returns.min():.4g} to {returns.max():.4g}, mean {returns.mean():.4g}"
+        print(f"{'returns':18s} {spread} (the file's own rewards, undiscounted)")
+    print(f"{'largest action':18s} {np.abs(rows.actions).max():.4g}")
+    if rows.quality is not None:
+        shares = ", ".join(f"{name} {np.mean(rows.quality == code):.1%}" for name, code in QUALITY.items())
+        print(f"{'behaviour':18s} {shares}")
 
 
 def _check(args: argparse.Namespace) -> int:
     if args.horizon < 1:
         raise UserError(f"--horizon must be at least 1, got {args.horizon}")
     env = _env(args.env, "mujoco")
-    arrays = formats.read_arrays(args.file)
-    errors = formats.validate(arrays, env)
-    notes: list[str] = []
-    if len(arrays["ends"]):
-        horizon_errors, notes = formats.horizon_lines(arrays["ends"], args.horizon)
-        errors += horizon_errors
-    for line in errors:
+    path = download.resolve(args.file)
+    rows = formats.load(path)
+    found = checks.inspect(rows, env, args.horizon, formats.read_attrs(path))
+    for line in found.errors:
         print(f"error: {line}")
-    for line in notes:
+    for line in found.notes:
         print(f"note: {line}")
-    if errors:
+    if args.map:
+        _draw_map(args.map, rows, env, path.name)
+    if found.errors:
         return _UNUSABLE
-    dataset = formats.read(args.file, env)
+    dataset = label(rows, env, str(path))
     episodes = dataset.episode_bounds
     reached = sum(1 for first, stop in episodes if (dataset.masks[first:stop] == 0).any())
     print(f"{args.file} fits {env.spec.full_name}: {dataset.size:,} transitions, {len(episodes):,} episodes")
     print(f"{reached:,} episodes reach the goal; {np.mean(dataset.masks == 0):.2%} of the rows are at it")
     return 0
+
+
+def _draw_map(out: str, rows: Rows, env: envs.TaskEnv, title: str) -> None:
+    from qdos_brax.report.coverage import draw_coverage  # here, for matplotlib takes a while
+
+    if rows.qpos is None or rows.qpos.shape[1:] != (env.engine.nq,):
+        raise UserError(f"a map needs the simulator states (qpos) of {env.spec.name}, which this file does not hold")
+    draw_coverage(rows.qpos, env, Path(out), f"{title}, {env.spec.full_name}")
+    print(out)
 
 
 def _env(name: str, physics: str) -> envs.TaskEnv:

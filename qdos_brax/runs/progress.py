@@ -21,9 +21,12 @@ class Progress:
         total: its chunks.
         done: chunks that an earlier process has done.
         stream: where to write; a bar if it is a terminal, else a line every ten seconds and at the end.
+        waiting_for: what the bar says until the first chunk is done.
     """
 
-    def __init__(self, phase: str, total: int, done: int = 0, stream: TextIO | None = None) -> None:
+    def __init__(
+        self, phase: str, total: int, done: int = 0, stream: TextIO | None = None, waiting_for: str = "compiling"
+    ) -> None:
         self._phase, self._total, self._first, self._done = phase, total, done, done
         self._stream = stream or sys.stderr
         self._started = self._spoken = time.monotonic()
@@ -37,7 +40,7 @@ class Progress:
                 dynamic_ncols=True,
                 bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}",
             )
-            self._bar.set_postfix_str("compiling")
+            self._bar.set_postfix_str(waiting_for)
 
     def __enter__(self) -> Self:
         return self

@@ -1,0 +1,109 @@
+"""What every reader makes of a file: one transition per row, as the file has it, not yet labelled for a task."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from qdos_brax.errors import UserError
+
+SAME = 1e-4  # what two copies of a position may differ by; they went through float32 and back
+
+
+@dataclass
+class Rows:
+    """N transitions in episode order, float32 and C-contiguous unless said otherwise.
+
+    Attributes:
+        observations: [N, obs].
+        actions: [N, act].
+        next_observations: [N, obs], the true next observation, at episode ends too.
+        ends: bool[N], the last row of each episode.
+        terminals: [N], 1 where the task ended by the file's own account; None when it does not say.
+        rewards: [N], the file's own, or None.
+        qpos: [N, nq] before the action, or None.
+        qvel: [N, nv] before the action, or None.
+        quality: int8[N], what produced the step, or None.
+        notes: what the reader had to mend or leave out, one line each.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    next_observations: np.ndarray
+    ends: np.ndarray
+    terminals: np.ndarray | None = None
+    rewards: np.ndarray | None = None
+    qpos: np.ndarray | None = None
+    qvel: np.ndarray | None = None
+    quality: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def size(self) -> int:
+        """Number of transitions."""
+        return len(self.observations)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays that are there, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+
+
+@contextlib.contextmanager
+def unreadable(path: Path) -> Iterator[None]:
+    """Turns whatever a damaged or foreign file makes the libraries raise into one clear line."""
+    try:
+        yield
+    except (
+        OSError,
+        EOFError,
+        ValueError,
+        TypeError,
+        LookupError,
+        ArithmeticError,
+        RuntimeError,  # h5py's word for most kinds of damage, zipfile's for an encrypted member
+        MemoryError,  # a damaged size
+        struct.error,
+        zlib.error,
+        zipfile.BadZipFile,
+        zipfile.LargeZipFile,
+    ) as error:
+        reason = " ".join(f"{error}".split()) or type(error).__name__
+        raise UserError(f"{path}: cannot be read as .npz or .hdf5 (truncated or another format): {reason}") from None
+
+
+def after_action(path: Path, rows: Rows) -> None:
+    """Mends simulator states that were stored after the action, as D4RL's ant mazes have them, in place.
+
+    D4RL's generator steps first and stores ``infos/qpos`` then, next to the observation from before. Where the body's
+    position says so, and the observation is qpos and qvel, they are taken from there.
+
+    Raises:
+        UserError: the states are from after the action and the observation does not hold those from before.
+    """
+    qpos, qvel, observations = rows.qpos, rows.qvel, rows.observations
+    if qpos is None or qpos.ndim != 2 or observations.ndim != 2 or not rows.size:
+        return
+    if min(qpos.shape[1], observations.shape[1]) < 2 or _agree(qpos, observations).mean() > 0.5:
+        return
+    if _agree(qpos, rows.next_observations).mean() < 0.99:
+        return
+    nq = qpos.shape[1]
+    if qvel is None or qvel.ndim != 2 or observations.shape[1] != nq + qvel.shape[1]:
+        raise UserError(f"{path}: qpos is that after the action, and the observations do not hold that before it")
+    qpos[:] = observations[:, :nq]
+    qvel[:] = observations[:, nq:]
+    rows.notes.append(
+        "qpos and qvel are those after the action, as D4RL stores them: taken from the observations instead"
+    )
+
+
+def _agree(qpos: np.ndarray, observations: np.ndarray) -> np.ndarray:
+    """bool[N]: the body is where the observation says; both begin with x and y in every locomotion task."""
+    return np.abs(qpos[:, :2] - observations[:, :2]).max(axis=1) <= SAME
