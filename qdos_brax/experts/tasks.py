@@ -1,0 +1,186 @@
+"""What experts are trained on: a body on an open floor, a commanded direction, a reward.
+
+Every function takes one life; the trainer maps them over many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs import models
+from envs.physics.base import Engine, PipelineState
+from envs.physics.mujoco_engine import MujocoEngine
+from qdos_brax.experts import policies
+from qdos_brax.experts.views import ANT_NQ, body_view, random_direction, turned, uprightness
+
+
+class Life(struct.PyTreeNode):
+    """One environment of the training.
+
+    Attributes:
+        pipeline: the simulator's state.
+        direction: float[2], the commanded direction, a unit vector.
+        clock: int, control steps since the start.
+    """
+
+    pipeline: PipelineState
+    direction: jax.Array
+    clock: jax.Array
+
+
+class Verdict(NamedTuple):
+    """What a control step was worth.
+
+    Attributes:
+        reward: float.
+        alive: bool, False where the body fell: the end, without a future.
+        lost: bool, the life is not worth going on with, but had a future.
+        measures: figures whose means are reported.
+    """
+
+    reward: jax.Array
+    alive: jax.Array
+    lost: jax.Array
+    measures: dict[str, jax.Array]
+
+
+class Task(Protocol):
+    """A body and what it shall learn.
+
+    Attributes:
+        name: of the expert, and of its weights.
+        engine: the physics.
+        observation_dim, action_dim: of the policy.
+        discount: per control step.
+        life_steps: a life ends after so many.
+        turn_every: mean steps between two draws of the direction.
+    """
+
+    name: str
+    engine: Engine
+    observation_dim: int
+    action_dim: int
+    discount: float
+    life_steps: int
+    turn_every: int
+
+    def reset(self, key: jax.Array) -> Life:
+        """A new life."""
+        ...
+
+    def observe(self, life: Life) -> jax.Array:
+        """float[observation_dim]."""
+        ...
+
+    def joints(self, life: Life, action: jax.Array) -> jax.Array:
+        """What the body gets, float[nu] in [-1, 1], for the policy's ``action[action_dim]``."""
+        ...
+
+    def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
+        """The step from ``before`` to ``after`` under ``joints``."""
+        ...
+
+
+class AntWalking:
+    """Reward: ten times the metres along the direction (OGBench's recipe); falling ends it."""
+
+    name = "ant_walker"
+    observation_dim, action_dim = 29, 8
+    discount, life_steps, turn_every = 0.99, 10**9, 100
+
+    def __init__(self) -> None:
+        self.engine = MujocoEngine(models.ant_model(), threads=1)
+
+    def reset(self, key: jax.Array) -> Life:
+        """A standing ant with OGBench's reset noise."""
+        qpos_key, qvel_key, direction_key = jax.random.split(key, 3)
+        rest = jnp.asarray(self.engine.model.qpos0, jnp.float32)
+        qpos = rest + jax.random.uniform(qpos_key, rest.shape, minval=-0.1, maxval=0.1)
+        pipeline = self.engine.init(qpos, 0.1 * jax.random.normal(qvel_key, (self.engine.nv,)))
+        return Life(pipeline, random_direction(direction_key), jnp.zeros((), jnp.int32))
+
+    def observe(self, life: Life) -> jax.Array:
+        """The body's view."""
+        return body_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
+
+    def joints(self, life: Life, action: jax.Array) -> jax.Array:
+        """The action itself."""
+        return action
+
+    def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
+        """See the class."""
+        speed = (after.qpos[:2] - before.pipeline.qpos[:2]) @ before.direction
+        return Verdict(10.0 * speed, ant_is_up(after.qpos), jnp.zeros((), bool), {"speed": speed})
+
+
+class AntDribbling:
+    """The ball shall roll along the direction, and the ant stay with it.
+
+    Reward per control step: ten times the ball's metres along the direction (at most 2 m/s count), less half of that
+    for metres aside; closeness to the ball; being behind it; a constant that makes falling cost something. A ball
+    rolls on almost without friction, so that one that is kicked away is lost: the life ends at LOST m, with a future.
+    """
+
+    name = "ant_dribbler"
+    observation_dim, action_dim = 35, 10
+    discount, life_steps, turn_every = 0.98, 300, 80
+
+    LOST = 5.0
+    FASTEST = 0.2  # m per control step
+
+    def __init__(self) -> None:
+        self.engine = MujocoEngine(models.ant_model(ball=True), threads=1)
+        self.walker = policies.ant_walker()
+
+    def reset(self, key: jax.Array) -> Life:
+        """A standing ant, turned at random, and a ball 0.7 to 3 m from it that lies or rolls."""
+        qpos_key, qvel_key, direction_key, place_key, gap_key, roll_key, speed_key, yaw_key = jax.random.split(key, 8)
+        rest = jnp.asarray(self.engine.model.qpos0, jnp.float32)
+        qpos = rest + jax.random.uniform(qpos_key, rest.shape, minval=-0.1, maxval=0.1)
+        yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
+        turn = jnp.stack([jnp.cos(yaw / 2), 0.0, 0.0, jnp.sin(yaw / 2)])
+        offset = jax.random.uniform(gap_key, (), minval=0.7, maxval=3.0) * random_direction(place_key)
+        qpos = qpos.at[3:7].set(turn).at[ANT_NQ : ANT_NQ + 2].set(qpos[:2] + offset).at[ANT_NQ + 2].set(0.25)
+        qvel = 0.1 * jax.random.normal(qvel_key, (self.engine.nv,))
+        roll = jnp.maximum(jax.random.uniform(speed_key, (), minval=-1.0, maxval=1.5), 0.0) * random_direction(roll_key)
+        pace = jnp.stack([roll[0], roll[1], 0.0, -4.0 * roll[1], 4.0 * roll[0], 0.0])  # rolls at radius 0.25
+        pipeline = self.engine.init(qpos, qvel.at[14:].set(pace))
+        return Life(pipeline, random_direction(direction_key), jnp.zeros((), jnp.int32))
+
+    def observe(self, life: Life) -> jax.Array:
+        """The ant's and the ball's view."""
+        return policies.dribbler_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
+
+    def joints(self, life: Life, action: jax.Array) -> jax.Array:
+        """The walker's action along a heading, and corrections."""
+        return policies.dribbler_joints(self.walker, life.pipeline.qpos, life.pipeline.qvel, life.direction, action)
+
+    def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
+        """See the class."""
+        ball = after.qpos[ANT_NQ : ANT_NQ + 2]
+        way = turned(ball - before.pipeline.qpos[ANT_NQ : ANT_NQ + 2], before.direction)
+        offset = ball - after.qpos[:2]
+        gap = jnp.linalg.norm(offset)
+        behind = offset @ before.direction / jnp.maximum(gap, 1e-6)
+        reward = (
+            1.0
+            + 10.0 * jnp.clip(way[0], -self.FASTEST, self.FASTEST)
+            - 5.0 * jnp.minimum(jnp.abs(way[1]), self.FASTEST)
+            - 0.3 * jnp.clip(gap - 0.7, 0.0, self.LOST)
+            + 0.2 * behind
+        )
+        measures = {"speed": way[0], "aside": jnp.abs(way[1]), "gap": gap}
+        return Verdict(reward, ant_is_up(after.qpos), gap > self.LOST, measures)
+
+
+def ant_is_up(qpos: jax.Array) -> jax.Array:
+    """bool[...]: the torso's height is within [0.2, 1.0] m and its own z axis points up."""
+    return (qpos[..., 2] > 0.2) & (qpos[..., 2] < 1.0) & (uprightness(qpos) > 0.0)
+
+
+TASKS: dict[str, Callable[[], Task]] = {"ant_walker": AntWalking, "ant_dribbler": AntDribbling}
