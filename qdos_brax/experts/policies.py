@@ -11,7 +11,7 @@ import zipfile
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,14 @@ from qdos_brax.networks import DiagonalGaussian
 RESIDUAL = 0.5
 """How much of a joint's range the dribbler can add to the walker's action."""
 
+# Where a dribbler heads before it has learned anything: round the ball, then through it; lengths in m.
+_CIRCLE = 1.3  # radius of the circle on which it goes round the ball
+_PULL = 1.1  # turn towards the circle per m beside it
+_LANE = 0.5  # half width of the lane behind the ball in which it pushes
+_FUNNEL = 0.75  # the lane widens by this much per m behind the ball
+_STEER = 2.0  # turn of the push per m of lateral offset
+_OVERRIDE = 1.5  # what is learned can turn the heading to anywhere
+
 
 class Policy(Protocol):
     """Whatever acts on a state and a direction; ``params`` are the arrays that tell one from another."""
@@ -34,6 +42,13 @@ class Policy(Protocol):
     def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
         """The deterministic action[..., nu] in [-1, 1] of a state [..., nq], [..., nv] for a unit vector[..., 2]."""
         ...
+
+
+@runtime_checkable
+class Dribbles(Policy, Protocol):
+    """A policy that takes a ball along the direction; its ``walker`` moves the body alone."""
+
+    walker: Policy
 
 
 @dataclass(frozen=True)
@@ -89,12 +104,28 @@ def dribbler_joints(
         qpos: [..., 22].
         qvel: [..., 20].
         direction: [..., 2].
-        command: [..., 10]; the first two are the heading, turned as the dribbler sees it, at any length.
+        command: [..., 10]; the first two are added to the heading of ``push_heading``.
     """
-    length = jnp.linalg.norm(command[..., :2], axis=-1, keepdims=True)
+    offset = ball_view(qpos, qvel, direction)[..., :2]
+    heading = _unit(push_heading(offset) + _OVERRIDE * command[..., :2])
     back = direction * jnp.array([1.0, -1.0])  # seen along this, what was turned is as it was in the world
-    heading = turned(command[..., :2] / jnp.maximum(length, 1e-6), back)
-    return jnp.clip(walker.act(qpos, qvel, heading) + RESIDUAL * command[..., 2:], -1.0, 1.0)
+    return jnp.clip(walker.act(qpos, qvel, turned(heading, back)) + RESIDUAL * command[..., 2:], -1.0, 1.0)
+
+
+def push_heading(offset: jax.Array) -> jax.Array:
+    """Unit vector[..., 2] round a ball at ``offset[..., 2]`` to behind it, then through it along +x."""
+    ahead, beside = offset[..., :1], offset[..., 1:]
+    push = _unit(jnp.concatenate([jnp.ones_like(ahead), _STEER * beside], axis=-1))
+    outward = -_unit(offset)
+    side = jnp.where(beside <= 0, 1.0, -1.0)
+    round_it = side * jnp.concatenate([-outward[..., 1:], outward[..., :1]], axis=-1)
+    gap = jnp.linalg.norm(offset, axis=-1, keepdims=True)
+    around = _unit(round_it + _PULL * (_CIRCLE - gap) * outward)
+    return jnp.where((ahead > 0) & (jnp.abs(beside) < _LANE + _FUNNEL * ahead), push, around)
+
+
+def _unit(vector: jax.Array) -> jax.Array:
+    return vector / jnp.maximum(jnp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6)
 
 
 class Dribbler:
@@ -169,6 +200,5 @@ def read_actor(path: Path) -> Actor:
         return Actor(tuple(header.pop("hidden")), dim, params, header)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise UserError(
-            f"cannot read the expert's weights in {path} ({error}); "
-            "train them with `python -m qdos_brax.experts.train`"
+            f"cannot read the expert's weights in {path} ({error}); train them with `python -m qdos_brax.experts.train`"
         ) from error

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from envs import models
-from envs.physics.base import Engine, PipelineState
+from envs.physics.base import PipelineState
 from envs.physics.mujoco_engine import MujocoEngine
 from qdos_brax.experts import policies
 from qdos_brax.experts.views import ANT_NQ, body_view, random_direction, turned, uprightness
@@ -62,7 +62,7 @@ class Task(Protocol):
     """
 
     name: str
-    engine: Engine
+    engine: MujocoEngine
     observation_dim: int
     action_dim: int
     discount: float
@@ -168,7 +168,7 @@ class AntDribbling:
         gap = jnp.linalg.norm(offset)
         behind = offset @ before.direction / jnp.maximum(gap, 1e-6)
         reward = (
-            1.0
+            0.2
             + 10.0 * jnp.clip(way[0], -self.FASTEST, self.FASTEST)
             - 5.0 * jnp.minimum(jnp.abs(way[1]), self.FASTEST)
             - 0.3 * jnp.clip(gap - 0.7, 0.0, self.LOST)
@@ -183,4 +183,68 @@ def ant_is_up(qpos: jax.Array) -> jax.Array:
     return (qpos[..., 2] > 0.2) & (qpos[..., 2] < 1.0) & (uprightness(qpos) > 0.0)
 
 
-TASKS: dict[str, Callable[[], Task]] = {"ant_walker": AntWalking, "ant_dribbler": AntDribbling}
+class HumanoidWalking:
+    """Upright and along the direction, 40 control steps per second.
+
+    Reward per control step: speed along the direction, up to PACE, as a share of it; half as much for being up;
+    facing the way; less for speed aside and for effort. Falling ends it. The direction is at first nearly where the
+    body faces, and now and then another.
+    """
+
+    name = "humanoid_walker"
+    observation_dim, action_dim = 55, 21
+    discount, life_steps, turn_every = 0.99, 1000, 400
+
+    PACE = 1.6  # m/s
+    STANDING = 1.29  # m, height of the torso
+
+    def __init__(self) -> None:
+        self.engine = MujocoEngine(models.humanoid_model(), threads=1)
+        self._seconds = self.engine.frame_skip * self.engine.model.opt.timestep
+
+    def reset(self, key: jax.Array) -> Life:
+        """On its feet, the direction mostly ahead."""
+        pose_key, qvel_key, yaw_key, direction_key = jax.random.split(key, 4)
+        yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
+        qpos, qvel = standing_humanoid(pose_key, yaw)
+        qvel = qvel + 0.1 * jax.random.normal(qvel_key, qvel.shape)
+        ahead = yaw + 0.6 * jax.random.normal(direction_key)
+        direction = jnp.stack([jnp.cos(ahead), jnp.sin(ahead)])
+        return Life(self.engine.init(qpos, qvel), direction, jnp.zeros((), jnp.int32))
+
+    def observe(self, life: Life) -> jax.Array:
+        """The body's view."""
+        return body_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
+
+    def joints(self, life: Life, action: jax.Array) -> jax.Array:
+        """The action itself."""
+        return action
+
+    def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
+        """See the class."""
+        velocity = turned(after.qpos[:2] - before.pipeline.qpos[:2], before.direction) / self._seconds
+        facing = body_view(after.qpos, after.qvel, before.direction)[1]
+        reward = (
+            jnp.clip(velocity[0], -self.PACE, self.PACE) / self.PACE
+            + 0.5 * uprightness(after.qpos)
+            + 0.2 * facing
+            - 0.2 * jnp.minimum(jnp.abs(velocity[1]), self.PACE)
+            - 0.1 * jnp.mean(joints**2)
+        )
+        return Verdict(
+            reward, humanoid_is_up(after.qpos), jnp.zeros((), bool), {"speed": velocity[0], "facing": facing}
+        )
+
+
+def standing_humanoid(key: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(qpos[28], qvel[27]) of a humanoid on its feet at the origin, turned by ``yaw``, its joints shifted a little."""
+    root = jnp.stack([0.0, 0.0, HumanoidWalking.STANDING, jnp.cos(yaw / 2), 0.0, 0.0, jnp.sin(yaw / 2)])
+    return jnp.concatenate([root, jax.random.uniform(key, (21,), minval=-0.05, maxval=0.05)]), jnp.zeros(27)
+
+
+def humanoid_is_up(qpos: jax.Array) -> jax.Array:
+    """bool[...]: the torso is at least 0.9 m high and within 60 degrees of the vertical."""
+    return (qpos[..., 2] > 0.9) & (uprightness(qpos) > 0.5)
+
+
+TASKS: dict[str, Callable[[], Task]] = {task.name: task for task in (AntWalking, AntDribbling, HumanoidWalking)}

@@ -2,7 +2,7 @@
 
 One jitted program steps all environments, fills the replay and makes the updates. The same command goes on where it
 was stopped, exactly; DIR holds ``checkpoints/``, the weights ``EXPERT.npz``, the curve ``EXPERT.csv``, and
-``EXPERT-learner.npz``: networks and optimiser without the replay, small enough to be kept, which ``--learner`` starts from.
+``EXPERT-learner.npz``: networks and optimiser without the replay, small enough to keep; ``--learner`` starts from it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from qdos_brax.high_level.sac import SAC, Batch, SACHyper, SACState
 from qdos_brax.runs.checkpoint import CheckpointStore, Position, choose
 from qdos_brax.runs.folder import write_text
 
-EVALUATION_STEPS = 1000
+EVALUATION_STEPS = 250
+INITIAL_TEMPERATURE = 0.1
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Trainer:
         observation = jnp.zeros(self.task.observation_dim)
         row = Batch(observation, jnp.zeros(self.task.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
         return TrainState(
-            sac=self.sac.init(sac_key, 1.0) if learner is None else learner,
+            sac=self.sac.init(sac_key, INITIAL_TEMPERATURE) if learner is None else learner,
             replay=replay_buffer.create(row, self.sizes.capacity),
             lives=jax.vmap(self.task.reset)(jax.random.split(reset_key, self.sizes.num_envs)),
             key=key,
@@ -187,7 +188,7 @@ class Training:
     """
 
     def __init__(
-        self, trainer: Trainer, folder: Path, seed: int, learner: Path | None = None, chunks_per_save: int = 10
+        self, trainer: Trainer, folder: Path, seed: int, learner: Path | None = None, chunks_per_save: int = 20
     ) -> None:
         self.trainer, self.folder, self.seed, self.chunks_per_save = trainer, folder, seed, chunks_per_save
         self.name, self.sizes = trainer.task.name, trainer.sizes
@@ -219,7 +220,7 @@ class Training:
             info = {name: float(value) for name, value in info.items()}
             self.seconds += time.monotonic() - began
             self.chunks_done += 1
-            row = {"steps": self.chunks_done * per_chunk, "seconds": round(self.seconds)}
+            row: dict[str, float] = {"steps": self.chunks_done * per_chunk, "seconds": round(self.seconds)}
             print(" ".join(f"{key}={value:.4g}" for key, value in (row | info).items()), flush=True)
             if self.chunks_done % self.chunks_per_save == 0 or self.chunks_done == last:
                 self._save(row, command)
@@ -286,12 +287,17 @@ def main() -> None:
     parser.add_argument("--steps", type=int, required=True, help="environment steps since the start")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--learner", type=Path, help="start from this learner, with an empty replay")
+    parser.add_argument("--width", type=int, default=256, help="of the two hidden layers of every network")
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    command = f"python -m qdos_brax.experts.train {args.expert} --steps {args.steps} --seed {args.seed}"
+    command = (
+        f"python -m qdos_brax.experts.train {args.expert} --steps {args.steps} --seed {args.seed} --width {args.width}"
+    )
     if args.learner is not None:
         command += f" --learner {args.learner.name}"
-    training = Training(Trainer(TASKS[args.expert](), Sizes()), args.out, args.seed, args.learner)
+    training = Training(
+        Trainer(TASKS[args.expert](), Sizes(hidden=(args.width,) * 2)), args.out, args.seed, args.learner
+    )
     training.run(args.steps, command)
 
 
