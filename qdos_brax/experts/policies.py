@@ -22,7 +22,7 @@ from qdos_brax.errors import UserError
 from qdos_brax.experts.views import ANT_NQ, ANT_NV, ball_view, body_view, turned
 from qdos_brax.networks import DiagonalGaussian
 
-RESIDUAL = 0.5
+RESIDUAL = 1.0
 """How much of a joint's range the dribbler can add to the walker's action."""
 
 # Where a dribbler heads before it has learned anything: round the ball, then through it; lengths in m.

@@ -115,7 +115,7 @@ def test_rewards_of_the_dribble_by_hand() -> None:
     before = life.replace(pipeline=life.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 0.9]))))
     after = life.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 1.0])))
     verdict = task.judge(before, jnp.zeros(8), after)
-    np.testing.assert_allclose(verdict.reward, 0.2 + 10 * 0.1 - 0.3 * 0.3 + 0.2, atol=1e-5)
+    np.testing.assert_allclose(verdict.reward, 0.5 + 40 * 0.1 - 0.3 * 0.3 + 0.2, atol=1e-5)
     assert verdict.alive and not verdict.lost
     far = life.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 5.1])).at[2].set(0.1))
     verdict = task.judge(before, jnp.zeros(8), far)
