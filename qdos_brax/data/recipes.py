@@ -120,4 +120,4 @@ def episode_kinds(mix: Mapping[str, float], episodes: int, seed: int) -> np.ndar
 
 def mix_text(mix: Mapping[str, float]) -> str:
     """What ``parse_mix`` reads."""
-    return ",".join(f"{name}={share:g}" for name, share in mix.items())
+    return ",".join(f"{name}={share}" for name, share in mix.items())
