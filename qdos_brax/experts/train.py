@@ -87,13 +87,16 @@ class Trainer:
 
     def init(self, key: jax.Array, learner: SACState | None = None) -> TrainState:
         """New lives, an empty replay, and ``learner``, or fresh networks."""
-        sac_key, reset_key, key = jax.random.split(key, 3)
+        sac_key, reset_key, clock_key, key = jax.random.split(key, 4)
+        n = self.sizes.num_envs
+        lives = jax.vmap(self.task.reset)(jax.random.split(reset_key, n))
+        clocks = jax.random.randint(clock_key, (n,), 0, self.task.life_steps)  # so that they do not all end at once
         observation = jnp.zeros(self.task.observation_dim)
         row = Batch(observation, jnp.zeros(self.task.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
         return TrainState(
             sac=self.sac.init(sac_key, INITIAL_TEMPERATURE) if learner is None else learner,
             replay=replay_buffer.create(row, self.sizes.capacity),
-            lives=jax.vmap(self.task.reset)(jax.random.split(reset_key, self.sizes.num_envs)),
+            lives=lives.replace(clock=clocks),
             key=key,
         )
 
