@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 
 import envs
-from qdos_brax.experts import walker
+from qdos_brax.experts import policies
 from qdos_brax.runs.folder import write_text
 
 STATES = 1000
@@ -60,8 +60,8 @@ class Policy:
         direction = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1), jnp.float32)
         self._random = rng.uniform(-1, 1, (DRIFT_STEPS // HOLD, ROLLOUTS, env.action_size)).astype(np.float32)
         self._walks = (np.arange(ROLLOUTS) < ROLLOUTS // 2)[:, None]
-        if env.action_size == walker.ACTION_DIM:
-            act = walker.load().act
+        if env.spec.family.startswith("ant"):
+            act = policies.ant_walker().act
             self._walk = jax.jit(lambda qpos, qvel: act(qpos[:, :15], qvel[:, :14], direction))
         else:
             self._walk = None

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 from tqdm import tqdm
 
+import qdos_brax
 from envs.task import TaskEnv
-from qdos_brax.data import collect, formats
+from qdos_brax.data import collect, formats, recipes
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
-from qdos_brax.experts import walker
+from qdos_brax.experts import policies
 
 
 def folder() -> Path:
@@ -45,17 +45,17 @@ def default_dataset(
     Raises:
         UserError: a parameter is out of range, no expert is shipped for the body, or the folder cannot be written.
     """
-    collect.check_expert(env)
-    policy = walker.load()
+    policy = collect.shipped_expert(env)
+    recipe = recipes.degraded(degraded_share, noise)
     parameters = f"n{transitions}-bad{degraded_share:g}-noise{noise:g}-seed{seed}-envs{num_envs}"
-    version = f"{env.backend}-v{collect.RECIPE}-{_digest(policy.params)}"
-    path = folder() / f"{collect.data_name(env)}-{parameters}-{version}.hdf5"
+    version = f"{env.backend}-v{collect.RECIPE}-{policies.digest(policy)}"
+    path = folder() / f"{env.spec.name}-{parameters}-{version}.hdf5"
     if path.exists():
         return path
     with locked(path):
         if not path.exists():  # another process may have made it while this one waited
-            print(f"no data for {collect.data_name(env)} yet: collecting {transitions:,} steps into {path}", flush=True)
-            make_file(path, env, transitions, degraded_share, noise, seed, num_envs, policy)
+            print(f"no data for {env.spec.name} yet: collecting {transitions:,} steps into {path}", flush=True)
+            make_file(path, env, transitions, recipe, seed, num_envs, policy)
     return path
 
 
@@ -63,26 +63,32 @@ def make_file(
     path: Path,
     env: TaskEnv,
     transitions: int,
-    degraded_share: float,
-    noise: float,
+    recipe: recipes.Recipe,
     seed: int,
     num_envs: int,
-    policy: walker.WalkerPolicy | None = None,
+    policy: policies.Policy | None = None,
 ) -> None:
-    """Collects a set (see ``collect.collect``) with a progress bar and writes it to ``path``."""
+    """Collects a set (see ``collect.collect``) with a progress bar; writes it to ``path`` with where it came from."""
+    policy = policy or collect.shipped_expert(env)
     with tqdm(total=transitions, unit="steps", unit_scale=True, desc="collect", file=sys.stderr) as bar:
 
         def report(done: int, total: int) -> None:
             bar.update(done - bar.n)
 
-        rows = collect.collect(env, transitions, degraded_share, noise, seed, num_envs, report, policy)
+        rows = collect.collect(env, transitions, recipe, seed, num_envs, report, policy)
     counts = np.bincount(rows["infos/quality"], minlength=len(QUALITY))
     attributes = {
         "env": env.spec.full_name,
         "seed": seed,
-        "recipe": f"degraded_share={degraded_share:g} noise={noise:g} num_envs={num_envs} physics={env.backend}",
+        "recipe": recipe.name,
+        "mix": recipes.mix_text(recipe.mix),
+        "noise": recipe.noise,
+        "num_envs": num_envs,
+        "physics": env.backend,
+        "expert": policies.digest(policy),
         "composition": " ".join(f"{name}={counts[code] / transitions:.3f}" for name, code in QUALITY.items()),
         "version": collect.RECIPE,
+        "packages": f"qdos-brax {qdos_brax.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}",
     }
     formats.write_hdf5(path, rows, attributes)
 
@@ -100,11 +106,3 @@ def locked(path: Path) -> Iterator[None]:
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
-
-
-def _digest(params: Any) -> str:
-    """Eight hex digits that tell one walker's weights from another's."""
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(params):
-        digest.update(np.asarray(leaf).tobytes())
-    return digest.hexdigest()[:8]

@@ -1,12 +1,10 @@
-"""Collects a task's offline data: episodes of repeated navigation, a stated share of them degraded.
+"""Collects a task's offline data: episodes of repeated navigation, by a recipe (``qdos_brax.data.recipes``).
 
-An episode starts at random free cells and runs for a fixed number of steps, whatever it reaches: the ant is sent to a
+An episode starts at random free cells and runs for a fixed number of steps, whatever it reaches: the body is sent to a
 random free cell along a shortest path (soccer: it brings the ball there), and on arrival to another. It is the same
-data for every task of a maze; only rewards and masks are the task's. A ball goes slowly and its goal is the
-cheapest of a few random cells: short ways that are finished show more than long ones that are not.
+data for every task of a maze; only rewards and masks are the task's.
 
-Degraded episodes are as likely one of three kinds: ``noisy`` navigates under heavy action noise, ``wander`` walks in
-random directions, ``fail`` turns round half-way and undoes what it did (soccer: brings the ball back).
+Which experts act where: the walker goes to the goal, or to the ball; near the ball the dribbler takes over.
 """
 
 from __future__ import annotations
@@ -23,17 +21,17 @@ from envs.physics.base import PipelineState
 from envs.soccer import BALL_QPOS
 from envs.task import GOAL_TOLERANCE, START_NOISE, TaskEnv
 from qdos_brax.data.quality import QUALITY
+from qdos_brax.data.recipes import Recipe, episode_kinds, named
 from qdos_brax.errors import UserError
-from qdos_brax.experts import walker
-from qdos_brax.experts.steering import Navigator, dribble_cost, dribble_direction, maze_direction
+from qdos_brax.experts import policies
+from qdos_brax.experts.steering import Navigator, approach, dribble_direction, maze_direction
+from qdos_brax.experts.views import random_direction
 
 RECIPE = 3
-"""Version of what is collected; part of the cache's file names."""
-
-_WALKER_FAMILIES = ("antmaze", "antsoccer")  # the shipped walker is an ant
+"""Version of what is collected; part of the cache's file names, as are the experts' weights."""
 
 HEAVY_NOISE = 1.0  # standard deviation of action noise in noisy episodes
-WANDER_STEPS = 30  # mean steps between two draws of a wanderer's direction
+WANDER_STEPS = 30  # mean steps between two draws of a wanderer's direction, where the recipe does not say
 CHUNK_STEPS = 50  # steps per call of the jitted program; the episode length is a multiple of it
 SHORTEST_EPISODE = 200
 
@@ -42,9 +40,8 @@ CHECK_STEPS = 60
 ESCAPE_STEPS = 30
 STUCK_MOVE = 0.5  # m within CHECK_STEPS, of the ant, or of a ball it is at
 AT_BALL = 2.0  # m
-BALL_GOAL_DRAWS = 6  # a ball's goal is the cheapest of so many random free cells
-TASK_SHARE = 0.5  # in soccer: of the starts, those near the task's goal; of the goals drawn, those that are the task's
-NEAR_GOAL = 4.5  # m, from the goal's cell to its neighbours
+DRIBBLE_REACH = 3.0  # m from the ball at which the dribbler takes over
+WITH_BALL = 0.5  # share of soccer's short episodes (stitch) that have anything to do with the ball
 PATIENCE = 200  # steps after which a failing attempt turns round in any case
 
 
@@ -53,21 +50,24 @@ Row = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 class Lane(struct.PyTreeNode):
-    """One environment while collecting. The cargo is what has to reach the goal: the ant, or in soccer the ball.
+    """One environment while collecting. The cargo is what has to reach the goal: the body itself, or the ball.
 
     Attributes:
         pipeline: the simulator's state.
         observation: float32[obs], what the task shows of it.
+        has_ball: bool, whether the cargo is the ball.
         goal_xy, origin_xy: float32[2], where the cargo goes, and where it was when that goal was drawn.
         turned: bool, a failing attempt that is on its way back to the origin.
         attempt: int32, steps since the goal was drawn or the attempt turned.
         heading: float32[2], a wanderer's direction.
-        away_xy: float32[2], escape: int32, where an ant that was stuck walks, and for how many steps more.
-        clock: int32, steps in this episode; seen_ant, seen_cargo: float32[2], positions at the last stuck check.
+        away_xy: float32[2], escape: int32, where a body that was stuck walks, and for how many steps more.
+        arrivals: int32, goals that the cargo was brought to.
+        clock: int32, steps in this episode; seen_body, seen_cargo: float32[2], positions at the last stuck check.
     """
 
     pipeline: PipelineState
     observation: jax.Array
+    has_ball: jax.Array
     goal_xy: jax.Array
     origin_xy: jax.Array
     turned: jax.Array
@@ -75,32 +75,31 @@ class Lane(struct.PyTreeNode):
     heading: jax.Array
     away_xy: jax.Array
     escape: jax.Array
+    arrivals: jax.Array
     clock: jax.Array
-    seen_ant: jax.Array
+    seen_body: jax.Array
     seen_cargo: jax.Array
 
 
 def collect(
     env: TaskEnv,
     transitions: int,
-    degraded_share: float,
-    noise: float,
+    recipe: Recipe,
     seed: int,
     num_envs: int = 64,
     progress: Callable[[int, int], None] | None = None,
-    policy: walker.WalkerPolicy | None = None,
+    policy: policies.Policy | None = None,
 ) -> dict[str, np.ndarray]:
     """Collects ``transitions`` rows; the same arguments on the same machine give the same rows.
 
     Args:
         env: the task; its engine does the steps.
         transitions: number of rows, at least SHORTEST_EPISODE.
-        degraded_share: share of the episodes that are degraded, 0 to 1.
-        noise: standard deviation of the Gaussian noise on every other episode's actions.
+        recipe: what is done.
         seed: of everything random.
         num_envs: environments stepped at once (fewer when there are not enough episodes).
         progress: called as ``progress(rows so far, rows)`` after every chunk.
-        policy: the walker; None takes the shipped one.
+        policy: the body's expert (soccer: a dribbler); None takes the shipped one.
 
     Returns:
         Rows in D4RL's flat layout, keyed as in the file (``infos/qpos``), with true ``next_observations``. No row is
@@ -109,19 +108,17 @@ def collect(
     Raises:
         UserError: an argument out of range, or a body that no expert is shipped for.
     """
-    check_expert(env)
     if transitions < SHORTEST_EPISODE:
         raise UserError(f"transitions must be at least {SHORTEST_EPISODE} (one episode), got {transitions}")
-    if not 0.0 <= degraded_share <= 1.0:
-        raise UserError(f"the degraded share must lie in [0, 1], got {degraded_share}")
-    if noise < 0.0 or num_envs < 1 or seed < 0:
-        raise UserError(f"noise and seed must be 0 or more, num_envs 1 or more; got {noise}, {seed}, {num_envs}")
-    length = _episode_length(transitions, num_envs, env.episode_length)
+    if num_envs < 1 or seed < 0:
+        raise UserError(f"seed must be 0 or more, num_envs 1 or more; got {seed}, {num_envs}")
+    expert = policy or shipped_expert(env)
+    length = recipe.episode_steps or _episode_length(transitions, num_envs, env.episode_length)
     episodes = -(-transitions // length)
     rounds = -(-episodes // num_envs)
     lanes = -(-episodes // rounds)
-    kinds = _episode_kinds(rounds * lanes, degraded_share, seed).reshape(rounds, lanes)
-    collector = Collector(env, policy or walker.load(), noise)
+    kinds = episode_kinds(recipe.mix, rounds * lanes, seed).reshape(rounds, lanes)
+    collector = Collector(env, expert, recipe)
     parts: list[dict[str, np.ndarray]] = []
     for index in range(rounds):
         key = jax.random.fold_in(jax.random.key(seed), index)
@@ -136,38 +133,66 @@ def collect(
     return rows
 
 
-def check_expert(env: TaskEnv) -> None:
-    """Raises UserError unless an expert is shipped that moves the task's body."""
-    if env.spec.family not in _WALKER_FAMILIES:
+def goals_per_1000(env: TaskEnv, policy: policies.Policy, noise: float, seed: int, episodes: int = 64) -> float:
+    """Goals reached per 1,000 steps, by episodes of the ``navigate`` recipe (soccer: by the ball), on average.
+
+    As in OGBench's script, a goal is a random free cell, and on arrival another is drawn.
+
+    Args:
+        env: the task.
+        policy: the body's expert.
+        noise: standard deviation of the action noise.
+        seed: of everything random.
+        episodes: how many, of 1,000 steps each.
+    """
+    collector = Collector(env, policy, named("navigate", noise))
+    kinds = np.full(episodes, QUALITY["navigate"], np.int8)
+    return float(np.mean(collector.run(jax.random.key(seed), kinds, 1000)[1].arrivals))
+
+
+def shipped_expert(env: TaskEnv) -> policies.Policy:
+    """The expert that moves the task's body, and its ball if it has one.
+
+    Raises:
+        UserError: none is shipped.
+    """
+    experts: dict[str, Callable[[], policies.Policy]] = {
+        "antmaze": policies.ant_walker,
+        "antsoccer": policies.ant_dribbler,
+    }
+    if env.spec.family not in experts:
         raise UserError(
             f"no expert is shipped for {env.spec.family}, so no data can be collected; "
             f"train with --dataset FILE, such as OGBench's {env.spec.name}-navigate-v0.npz"
         )
-
-
-def data_name(env: TaskEnv) -> str:
-    """What a default set is called: soccer's depends on the task, a maze's does not."""
-    return env.spec.full_name if env.spec.family == "antsoccer" else env.spec.name
+    return experts[env.spec.family]()
 
 
 class Collector:
     """The jitted program that runs many lanes.
 
     Args:
-        env: the task; ``antsoccer`` tasks move the ball, all others the ant.
-        policy: the walker.
-        noise: standard deviation of the action noise of undegraded episodes.
+        env: the task; ``antsoccer`` tasks move the ball, all others the body.
+        policy: the expert; of soccer a dribbler, which has a ``walker``.
+        recipe: what is done.
     """
 
-    def __init__(self, env: TaskEnv, policy: walker.WalkerPolicy, noise: float) -> None:
-        self.env, self.policy, self.noise = env, policy, noise
+    def __init__(self, env: TaskEnv, policy: policies.Policy, recipe: Recipe) -> None:
+        self.env, self.recipe = env, recipe
+        self.dribbler = policy if isinstance(policy, policies.Dribbles) else None
+        self.walker = policy.walker if isinstance(policy, policies.Dribbles) else policy
         self.navigator = Navigator(env.layout)
-        self.has_ball = env.spec.family == "antsoccer"
 
     def episodes(
         self, key: jax.Array, kinds: np.ndarray, length: int, progress: Callable[[int], None] | None = None
     ) -> dict[str, np.ndarray]:
-        """One episode of ``length`` steps (a multiple of CHUNK_STEPS) per entry of ``kinds[L]``, one after another."""
+        """The rows of ``run``, one episode after another."""
+        return self.run(key, kinds, length, progress)[0]
+
+    def run(
+        self, key: jax.Array, kinds: np.ndarray, length: int, progress: Callable[[int], None] | None = None
+    ) -> tuple[dict[str, np.ndarray], Lane]:
+        """An episode of ``length`` steps (a multiple of CHUNK_STEPS) per entry of ``kinds[L]``: rows, last states."""
         n = len(kinds)
         reset_key, chunk_key = jax.random.split(key)
         lanes = self._reset(jax.random.split(reset_key, n))
@@ -191,7 +216,7 @@ class Collector:
             "infos/qvel": qvel,
             "infos/quality": np.repeat(kinds[:, None], length, axis=1),
         }
-        return {name: value.reshape(n * length, *value.shape[2:]) for name, value in rows.items()}
+        return {name: value.reshape(n * length, *value.shape[2:]) for name, value in rows.items()}, lanes
 
     @partial(jax.jit, static_argnums=0)
     def _reset(self, keys: jax.Array) -> Lane:
@@ -210,25 +235,35 @@ class Collector:
 
     def _reset_lane(self, key: jax.Array) -> Lane:
         """Everything at random free cells, with the task's reset noise; the first goal is drawn."""
-        reset_key, ant_key, ball_key, goal_key, heading_key = jax.random.split(key, 5)
+        reset_key, body_key, ball_key, goal_key, heading_key = jax.random.split(key, 5)
         start = self.env.reset(reset_key).pipeline_state
-        qpos = start.qpos.at[:2].set(self._start_xy(ant_key))
-        if self.has_ball:
-            qpos = qpos.at[BALL_QPOS : BALL_QPOS + 2].set(self._ball_xy(ball_key))
-        ant, cargo = self._positions(qpos)
+        qpos = start.qpos.at[:2].set(self._start_xy(body_key))
+        has_ball = jnp.asarray(self.dribbler is not None)
+        if self.dribbler is not None:
+            share_key, ball_key = jax.random.split(ball_key)
+            ball_xy = self._start_xy(ball_key)
+            if self.recipe.goal_cells is not None:  # a short episode: about the ball if it begins at it
+                has_ball = jax.random.uniform(share_key) < WITH_BALL
+                shift = jax.random.uniform(ball_key, (2,), minval=-START_NOISE, maxval=START_NOISE)
+                beside = self.navigator.centre(self.navigator.cell(qpos[:2])) + shift
+                ball_xy = jnp.where(has_ball, beside, ball_xy)
+            qpos = qpos.at[BALL_QPOS : BALL_QPOS + 2].set(ball_xy)
+        body, cargo = self._positions(qpos, has_ball)
         pipeline = self.env.engine.init(qpos, start.qvel)
         return Lane(
             pipeline=pipeline,
             observation=self.env.observe(pipeline),
-            goal_xy=self._goal_xy(goal_key, ant, cargo),
+            has_ball=has_ball,
+            goal_xy=self._goal_xy(goal_key, cargo),
             origin_xy=cargo,
             turned=jnp.zeros((), bool),
             attempt=jnp.zeros((), jnp.int32),
-            heading=_random_direction(heading_key),
-            away_xy=ant,
+            heading=random_direction(heading_key),
+            away_xy=body,
             escape=jnp.zeros((), jnp.int32),
+            arrivals=jnp.zeros((), jnp.int32),
             clock=jnp.zeros((), jnp.int32),
-            seen_ant=ant,
+            seen_body=body,
             seen_cargo=cargo,
         )
 
@@ -237,36 +272,25 @@ class Collector:
         shift = jax.random.uniform(shift_key, (2,), minval=-START_NOISE, maxval=START_NOISE)
         return self.navigator.random_free_xy(cell_key) + shift
 
-    def _ball_xy(self, key: jax.Array) -> jax.Array:
-        """Where a ball starts: TASK_SHARE of them in the task's goal's cell or beside it, the others anywhere."""
-        share_key, cell_key, shift_key, anywhere_key = jax.random.split(key, 4)
-        gap = jnp.linalg.norm(self.navigator.free_xy - self.env.goal_xy, axis=-1)
-        beside = self.navigator.free_xy[jax.random.categorical(cell_key, jnp.where(gap < NEAR_GOAL, 0.0, -jnp.inf))]
-        near = beside + jax.random.uniform(shift_key, (2,), minval=-START_NOISE, maxval=START_NOISE)
-        return jnp.where(jax.random.uniform(share_key) < TASK_SHARE, near, self._start_xy(anywhere_key))
-
-    def _goal_xy(self, key: jax.Array, ant: jax.Array, cargo: jax.Array) -> jax.Array:
-        """The centre[2] of a random free cell; of a ball the task's goal, or the cheapest of several (dribble_cost)."""
-        if not self.has_ball:
+    def _goal_xy(self, key: jax.Array, cargo: jax.Array) -> jax.Array:
+        """The centre[2] of a random free cell, or of one as far from the cargo as the recipe says."""
+        if self.recipe.goal_cells is None:
             return self.navigator.random_free_xy(key)
-        share_key, draw_key = jax.random.split(key)
-        draws = jax.vmap(self.navigator.random_free_xy)(jax.random.split(draw_key, BALL_GOAL_DRAWS))
-        cheapest = draws[jnp.argmin(jax.vmap(partial(dribble_cost, self.navigator, ant, cargo))(draws))]
-        is_there = jnp.linalg.norm(cargo - self.env.goal_xy) < 2 * GOAL_TOLERANCE
-        takes_the_tasks = (jax.random.uniform(share_key) < TASK_SHARE) & ~is_there
-        return jnp.where(takes_the_tasks, self.env.goal_xy, cheapest)
+        return self.navigator.random_xy_at(key, self.navigator.cell(cargo), self.recipe.goal_cells)
 
-    def _positions(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """xy[2] of the ant and of the cargo."""
-        cargo = BALL_QPOS if self.has_ball else 0
-        return qpos[:2], qpos[cargo : cargo + 2]
+    def _positions(self, qpos: jax.Array, has_ball: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """xy[2] of the body and of the cargo."""
+        body = qpos[:2]
+        if self.dribbler is None:
+            return body, body
+        return body, jnp.where(has_ball, qpos[BALL_QPOS : BALL_QPOS + 2], body)
 
     def _step_lane(self, lane: Lane, kind: jax.Array, key: jax.Array) -> tuple[Lane, Row]:
         plan_key, noise_key, teleport_key = jax.random.split(key, 3)
         lane = self._plan(lane, kind, plan_key)
         qpos, qvel = lane.pipeline.qpos, lane.pipeline.qvel
-        action = self.policy.act(qpos, qvel, self._direction(lane, kind))
-        sigma = jnp.where(kind == QUALITY["noisy"], HEAVY_NOISE, self.noise)
+        action = self._action(lane, kind)
+        sigma = jnp.where(kind == QUALITY["noisy"], HEAVY_NOISE, self.recipe.noise)
         action = jnp.clip(action + sigma * jax.random.normal(noise_key, action.shape), -1.0, 1.0)
         row = (qpos, qvel, lane.observation, action)
         pipeline = self.env.engine.step(lane.pipeline, action)
@@ -280,9 +304,9 @@ class Collector:
         return lane, row
 
     def _plan(self, lane: Lane, kind: jax.Array, key: jax.Array) -> Lane:
-        """Turns a failing attempt, draws a new goal on arrival or when stuck, sends a stuck ant elsewhere."""
+        """Turns a failing attempt, draws a new goal on arrival or when stuck, sends a stuck body elsewhere."""
         goal_key, away_key, turn_key, heading_key = jax.random.split(key, 4)
-        ant, cargo = self._positions(lane.pipeline.qpos)
+        body, cargo = self._positions(lane.pipeline.qpos, lane.has_ball)
         gap = jnp.linalg.norm(cargo - lane.goal_xy)
         half_way = gap < 0.5 * jnp.linalg.norm(lane.origin_xy - lane.goal_xy)
         impatient = lane.attempt >= PATIENCE
@@ -290,39 +314,54 @@ class Collector:
         undone = lane.turned & ((jnp.linalg.norm(cargo - lane.origin_xy) < 2 * GOAL_TOLERANCE) | impatient)
 
         checks = (lane.clock % CHECK_STEPS == 0) & (lane.clock > 0)
-        stuck = checks & self._is_stuck(lane, ant, cargo)
-        redraw = undone | stuck | (~lane.turned & (gap < GOAL_TOLERANCE))
-        wander_turns = jax.random.uniform(turn_key) < 1 / WANDER_STEPS
+        stuck = checks & self._is_stuck(lane, body, cargo)
+        arrived = ~lane.turned & (gap < GOAL_TOLERANCE)
+        redraw = undone | stuck | arrived if self.recipe.goal_cells is None else jnp.zeros((), bool)
+        if self.recipe.heading_steps is None:
+            heads_anew = jax.random.uniform(turn_key) < 1 / WANDER_STEPS
+        else:
+            heads_anew = lane.clock % self.recipe.heading_steps == 0
         return lane.replace(
-            goal_xy=jnp.where(redraw, self._goal_xy(goal_key, ant, cargo), lane.goal_xy),
+            goal_xy=jnp.where(redraw, self._goal_xy(goal_key, cargo), lane.goal_xy),
             origin_xy=jnp.where(redraw, cargo, lane.origin_xy),
             turned=jnp.where(redraw, False, lane.turned | turns),
             attempt=jnp.where(redraw | turns, 0, lane.attempt),
-            heading=jnp.where(wander_turns, _random_direction(heading_key), lane.heading),
+            heading=jnp.where(heads_anew, random_direction(heading_key), lane.heading),
             away_xy=jnp.where(stuck, self.navigator.random_free_xy(away_key), lane.away_xy),
             escape=jnp.where(stuck, ESCAPE_STEPS, lane.escape),
-            seen_ant=jnp.where(checks, ant, lane.seen_ant),
+            arrivals=lane.arrivals + (arrived & redraw),
+            seen_body=jnp.where(checks, body, lane.seen_body),
             seen_cargo=jnp.where(checks, cargo, lane.seen_cargo),
         )
 
-    def _is_stuck(self, lane: Lane, ant: jax.Array, cargo: jax.Array) -> jax.Array:
-        """bool: since the last check the ant hardly moved, or the ball did not though the ant was at it all along."""
-        still = jnp.linalg.norm(ant - lane.seen_ant) < STUCK_MOVE
+    def _is_stuck(self, lane: Lane, body: jax.Array, cargo: jax.Array) -> jax.Array:
+        """bool: since the last check the body hardly moved, or the ball did not though it was at it all along."""
+        still = jnp.linalg.norm(body - lane.seen_body) < STUCK_MOVE
         ball_still = jnp.linalg.norm(cargo - lane.seen_cargo) < STUCK_MOVE
-        at_ball = (jnp.linalg.norm(ant - cargo) < AT_BALL) & (
-            jnp.linalg.norm(lane.seen_ant - lane.seen_cargo) < AT_BALL
+        at_ball = (jnp.linalg.norm(body - cargo) < AT_BALL) & (
+            jnp.linalg.norm(lane.seen_body - lane.seen_cargo) < AT_BALL
         )
-        return still | (ball_still & at_ball) if self.has_ball else still
+        return still | (ball_still & at_ball & lane.has_ball)
 
-    def _direction(self, lane: Lane, kind: jax.Array) -> jax.Array:
-        ant, cargo = self._positions(lane.pipeline.qpos)
+    def _action(self, lane: Lane, kind: jax.Array) -> jax.Array:
+        """The experts' action[nu], without noise."""
+        qpos, qvel = lane.pipeline.qpos, lane.pipeline.qvel
+        body, cargo = self._positions(qpos, lane.has_ball)
         target = jnp.where(lane.turned, lane.origin_xy, lane.goal_xy)
-        if self.has_ball:
-            direction = dribble_direction(self.navigator, ant, cargo, target)
-        else:
-            direction = maze_direction(self.navigator, ant, target)
-        direction = jnp.where(lane.escape > 0, maze_direction(self.navigator, ant, lane.away_xy), direction)
-        return jnp.where(kind == QUALITY["wander"], lane.heading, direction)
+        away = maze_direction(self.navigator, body, lane.away_xy)
+        on_foot = maze_direction(self.navigator, body, target)
+        if self.dribbler is not None:
+            to_ball, in_sight = approach(self.navigator, body, cargo)
+            on_foot = jnp.where(lane.has_ball, to_ball, on_foot)
+        direction = jnp.where(lane.escape > 0, away, on_foot)
+        direction = jnp.where(kind == QUALITY["wander"], lane.heading, direction)
+        action = self.walker.act(qpos, qvel, direction)
+        if self.dribbler is None:
+            return action
+        near = in_sight & (jnp.linalg.norm(cargo - body) < DRIBBLE_REACH)
+        dribbles = lane.has_ball & near & (lane.escape == 0) & (kind != QUALITY["wander"])
+        push = dribble_direction(self.navigator, cargo, target)
+        return jnp.where(dribbles, self.dribbler.act(qpos, qvel, push), action)
 
 
 def _episode_length(transitions: int, num_envs: int, cap: int) -> int:
@@ -330,19 +369,5 @@ def _episode_length(transitions: int, num_envs: int, cap: int) -> int:
     return min(max(transitions // num_envs, SHORTEST_EPISODE), cap) // CHUNK_STEPS * CHUNK_STEPS
 
 
-def _episode_kinds(episodes: int, degraded_share: float, seed: int) -> np.ndarray:
-    """int8[episodes], a quality code per episode in random order, the degraded kinds in equal parts."""
-    degraded = [code for code in QUALITY.values() if code != QUALITY["navigate"]]
-    kinds = np.full(episodes, QUALITY["navigate"], np.int8)
-    count = round(degraded_share * episodes)
-    kinds[:count] = np.resize(degraded, count)
-    return np.random.default_rng(seed).permutation(kinds)
-
-
 def _offset(progress: Callable[[int, int], None], done: int, total: int) -> Callable[[int], None]:
     return lambda rows: progress(min(done + rows, total), total)
-
-
-def _random_direction(key: jax.Array) -> jax.Array:
-    angle = jax.random.uniform(key, (), minval=-jnp.pi, maxval=jnp.pi)
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import envs
-from qdos_brax.data import cache, checks, download, formats, sources
+from qdos_brax.data import cache, checks, download, formats, recipes, sources
 from qdos_brax.data.dataset import episode_bounds
 from qdos_brax.data.labelling import label
 from qdos_brax.data.quality import QUALITY
@@ -24,15 +24,27 @@ def add_parser(commands: Any) -> None:
     data = commands.add_parser("data", help="make, look at and check data files")
     actions = data.add_subparsers(metavar="ACTION", required=True)
 
-    make = actions.add_parser("make", help="collect a set: repeated navigation, a share of it degraded")
+    make = actions.add_parser("make", help="collect a set, by OGBench's recipes or a mixture of good and bad behaviour")
     make.add_argument("task", metavar="TASK", help="the task, as listed by: python -m qdos_brax tasks")
     make.add_argument("--out", metavar="FILE", required=True, help="the file to write (.hdf5, D4RL's flat layout)")
     make.add_argument("--transitions", metavar="N", type=int, default=200_000, help="rows (default 200000)")
     make.add_argument(
-        "--degraded-share", metavar="P", type=float, default=0.5, help="share of degraded episodes (default 0.5)"
+        "--recipe",
+        choices=recipes.NAMES,
+        default="mixed",
+        help="OGBench's navigate, stitch or explore, or a mixture of good and bad behaviour (default mixed)",
     )
     make.add_argument(
-        "--noise", metavar="X", type=float, default=0.2, help="action noise of the other episodes (default 0.2)"
+        "--mix", metavar="M", help="mixed: share of each behaviour, as expert=0.3,noisy=0.3,wander=0.2,fail=0.2"
+    )
+    make.add_argument(
+        "--degraded-share",
+        metavar="P",
+        type=float,
+        help="mixed: share of degraded episodes, in equal parts (default 0.5)",
+    )
+    make.add_argument(
+        "--noise", metavar="X", type=float, help="action noise of the other episodes (default 0.2, explore 1)"
     )
     make.add_argument("--seed", metavar="S", type=int, default=0, help="seed (default 0)")
     make.add_argument("--num-envs", metavar="N", type=int, default=64, help="environments at once (default 64)")
@@ -68,9 +80,22 @@ def _make(args: argparse.Namespace) -> int:
     if path.suffix not in (".hdf5", ".h5"):
         raise UserError(f"--out {args.out}: data is written as .hdf5; give the file that ending")
     env = _env(args.task, args.physics)
-    cache.make_file(path, env, args.transitions, args.degraded_share, args.noise, args.seed, args.num_envs)
+    cache.make_file(path, env, args.transitions, _recipe(args), args.seed, args.num_envs)
     print(path)
     return 0
+
+
+def _recipe(args: argparse.Namespace) -> recipes.Recipe:
+    if args.recipe != "mixed":
+        if args.mix is not None or args.degraded_share is not None:
+            raise UserError(f"--recipe {args.recipe} takes neither --mix nor --degraded-share; mixed does")
+        return recipes.named(args.recipe, args.noise)
+    noise = recipes.NOISE if args.noise is None else args.noise
+    if args.mix is None:
+        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, noise)
+    if args.degraded_share is not None:
+        raise UserError("--mix and --degraded-share both say what is mixed; give one of them")
+    return recipes.mixed(recipes.parse_mix(args.mix), noise)
 
 
 def _fetch(args: argparse.Namespace) -> int:

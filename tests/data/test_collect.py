@@ -1,4 +1,4 @@
-"""Collection on real physics with a stand-in walker: sizes, codes, true next states, one seed repeats, two differ."""
+"""Collection on real physics with a stand-in expert: sizes, codes, true next states, one seed repeats, two differ."""
 
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import envs
-from qdos_brax.data import cache, collect, formats
+from qdos_brax.data import cache, collect, formats, recipes
 from qdos_brax.data.commands import add_parser
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
+from qdos_brax.experts import policies
 
 ROWS = 650  # three episodes of 200 steps and one that is cut
 
@@ -26,6 +27,22 @@ class StandIn:
         return jnp.sin(jnp.concatenate([3 * direction, qvel[:3], qpos[2:3], qpos[7:9]]))
 
 
+class StandInDribbler(StandIn):
+    """The same with a ball: turns the other way."""
+
+    walker = StandIn()
+
+    def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+        return -super().act(qpos, qvel, direction)
+
+
+def expert(env: envs.TaskEnv) -> StandIn:
+    return StandInDribbler() if env.spec.family == "antsoccer" else StandIn()
+
+
+DEFAULT = recipes.degraded(0.5, 0.2)
+
+
 @pytest.fixture(scope="module", params=["antmaze-medium", "antsoccer-arena"])
 def env(request: Any) -> envs.TaskEnv:
     return envs.make(request.param, physics="mujoco")
@@ -35,7 +52,7 @@ def env(request: Any) -> envs.TaskEnv:
 def rows(env: envs.TaskEnv) -> dict[str, np.ndarray]:
     seen: list[tuple[int, int]] = []
     rows = collect.collect(
-        env, ROWS, 0.5, 0.2, seed=0, num_envs=2, progress=lambda *at: seen.append(at), policy=StandIn()
+        env, ROWS, DEFAULT, seed=0, num_envs=2, progress=lambda *at: seen.append(at), policy=expert(env)
     )
     assert seen[-1] == (ROWS, ROWS) and seen == sorted(seen)
     return rows
@@ -69,10 +86,10 @@ def test_next_observations_are_what_the_engine_makes_of_the_row(env: envs.TaskEn
 # Soccer alone: it does all that a maze does, and a second collection takes time.
 @pytest.mark.parametrize("env", ["antsoccer-arena"], indirect=True)
 def test_one_seed_repeats_and_two_differ(env: envs.TaskEnv, rows: dict[str, np.ndarray]) -> None:
-    again = collect.collect(env, ROWS, 0.5, 0.2, seed=0, num_envs=2, policy=StandIn())
+    again = collect.collect(env, ROWS, DEFAULT, seed=0, num_envs=2, policy=expert(env))
     for key, value in rows.items():
         np.testing.assert_array_equal(again[key], value, err_msg=key)
-    other = collect.collect(env, ROWS, 0.5, 0.2, seed=1, num_envs=2, policy=StandIn())
+    other = collect.collect(env, ROWS, DEFAULT, seed=1, num_envs=2, policy=expert(env))
     assert not np.array_equal(other["actions"], rows["actions"])
     assert not np.array_equal(other["infos/qpos"][0], rows["infos/qpos"][0])
 
@@ -89,7 +106,7 @@ def test_teleporters_work_while_collecting() -> None:
             return jax.random.choice(key, jnp.asarray(entrances, jnp.float32))
 
     kinds = np.full(12, QUALITY["wander"], np.int8)
-    rows = AtEntrances(env, StandIn(), 0.2).episodes(jax.random.key(0), kinds, collect.CHUNK_STEPS)
+    rows = AtEntrances(env, StandIn(), DEFAULT).episodes(jax.random.key(0), kinds, collect.CHUNK_STEPS)
     first = np.arange(12) * collect.CHUNK_STEPS
     came_out = rows["infos/qpos"][first + 1, :2]
     assert {tuple(xy) for xy in came_out} == {tuple(xy) for xy in exits}
@@ -102,16 +119,17 @@ def test_teleporters_work_while_collecting() -> None:
 def test_a_body_without_an_expert_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     env = envs.make("humanoidmaze", physics="mujoco")
     monkeypatch.setenv("QDOS_DATA", str(tmp_path))
-    parameters: dict[str, Any] = {"transitions": 400, "degraded_share": 0.5, "noise": 0.2, "seed": 0}
-    for make in (collect.collect, cache.default_dataset):
-        with pytest.raises(UserError, match=r"no expert .* humanoidmaze.*--dataset FILE.*humanoidmaze-medium-navigate"):
-            make(env, **parameters)
+    refused = pytest.raises(UserError, match=r"no expert .* humanoidmaze.*--dataset FILE.*humanoidmaze-medium-navigate")
+    with refused:
+        collect.collect(env, 400, DEFAULT, seed=0)
+    with refused:
+        cache.default_dataset(env, transitions=400, degraded_share=0.5, noise=0.2, seed=0)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_the_share_of_degraded_episodes_is_as_stated(share: float) -> None:
-    kinds = collect._episode_kinds(100, share, seed=0)
+    kinds = recipes.episode_kinds(recipes.degraded(share).mix, 100, seed=0)
     assert (kinds != QUALITY["navigate"]).sum() == round(100 * share)
     counts = [int((kinds == code).sum()) for code in QUALITY.values() if code != QUALITY["navigate"]]
     assert max(counts) - min(counts) <= 1
@@ -125,14 +143,69 @@ def test_small_sets_have_shorter_episodes(transitions: int, num_envs: int, lengt
     assert collect._episode_length(transitions, num_envs, 1000) == length
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"transitions": 10}, {"degraded_share": 1.5}, {"noise": -1.0}, {"num_envs": 0}, {"seed": -1}],
-)
+@pytest.mark.parametrize("wrong", [{"transitions": 10}, {"num_envs": 0}, {"seed": -1}])
 def test_arguments_out_of_range_are_refused(env: envs.TaskEnv, wrong: dict[str, Any]) -> None:
-    right = {"transitions": 200, "degraded_share": 0.5, "noise": 0.2, "seed": 0, "num_envs": 2, "policy": StandIn()}
+    right = {"transitions": 200, "recipe": DEFAULT, "seed": 0, "num_envs": 2, "policy": expert(env)}
     with pytest.raises(UserError):
         collect.collect(env, **(right | wrong))
+
+
+def test_a_mix_is_exact_to_the_episode_and_comes_from_the_seed() -> None:
+    mix = recipes.parse_mix("expert=0.3,noisy=0.3,wander=0.2,fail=0.2")
+    kinds = recipes.episode_kinds(mix, 50, seed=3)
+    assert np.bincount(kinds).tolist() == [15, 15, 10, 10]
+    np.testing.assert_array_equal(kinds, recipes.episode_kinds(mix, 50, seed=3))
+    assert not np.array_equal(kinds, recipes.episode_kinds(mix, 50, seed=4))
+    # 7 episodes: 2.1, 2.1, 1.4, 1.4; five are bad, of which 2.14, 1.43, 1.43: the first of the largest remainders gains
+    assert np.bincount(recipes.episode_kinds(mix, 7, seed=0)).tolist() == [2, 2, 2, 1]
+    assert set(recipes.episode_kinds({"wander": 1.0}, 9, seed=0).tolist()) == {QUALITY["wander"]}
+    assert recipes.parse_mix(recipes.mix_text(mix)) == mix
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("expert=0.5,noisy=0.4", "sum to 0.9"),
+        ("expert=1.5,noisy=-0.5", r"must lie in \[0, 1\]"),
+        ("expert=0.5,noisey=0.5", "no behaviour 'noisey'"),
+        ("expert=0.5,expert=0.5", "expert is there twice"),
+        ("expert", "'expert' is no share"),
+        ("expert=nan", "must lie in"),
+    ],
+)
+def test_a_mix_that_makes_no_sense_is_refused(text: str, line: str) -> None:
+    with pytest.raises(UserError, match=line):
+        recipes.mixed(recipes.parse_mix(text))
+
+
+@pytest.mark.parametrize("make", [lambda: recipes.degraded(1.5), lambda: recipes.named("explore", noise=-1.0)])
+def test_a_recipe_out_of_range_is_refused(make: Any) -> None:
+    with pytest.raises(UserError):
+        make()
+
+
+def test_stitch_keeps_its_goal_and_explore_its_heading() -> None:
+    env = envs.make("antsoccer-arena", physics="mujoco")
+    stitch = collect.Collector(env, expert(env), recipes.named("stitch"))
+    lanes = stitch._reset(jax.random.split(jax.random.key(0), 32))
+    cargo = np.where(lanes.has_ball[:, None], lanes.pipeline.qpos[:, 15:17], lanes.pipeline.qpos[:, :2])
+    steps = np.abs(env.layout.xy_to_ij(cargo) - env.layout.xy_to_ij(np.asarray(lanes.goal_xy))).sum(axis=1)
+    assert (steps == 4).all()  # an open field: cells to go are those of rows and columns
+    assert 4 < int(lanes.has_ball.sum()) < 28
+    kinds = jnp.zeros(32, jnp.int8)
+    plan = jax.jit(jax.vmap(stitch._plan))
+    at_goal = lanes.replace(has_ball=jnp.zeros(32, bool), goal_xy=lanes.pipeline.qpos[:, :2])
+    after = plan(at_goal, kinds, jax.random.split(jax.random.key(1), 32))
+    np.testing.assert_array_equal(after.goal_xy, at_goal.goal_xy)
+    navigate = collect.Collector(env, expert(env), recipes.named("navigate"))
+    after = jax.jit(jax.vmap(navigate._plan))(at_goal, kinds, jax.random.split(jax.random.key(1), 32))
+    assert after.arrivals.tolist() == [1] * 32 and not np.array_equal(after.goal_xy, at_goal.goal_xy)
+
+    explore = jax.jit(jax.vmap(collect.Collector(env, expert(env), recipes.named("explore"))._plan))
+    keys = jax.random.split(jax.random.key(2), 32)
+    for clock, changes in ((10, True), (11, False), (19, False), (20, True)):
+        turned = explore(lanes.replace(clock=jnp.full(32, clock)), kinds + QUALITY["wander"], keys).heading
+        assert bool((turned != lanes.heading).any(axis=1).all()) == changes == bool((turned != lanes.heading).any())
 
 
 def test_the_default_set_is_collected_once(
@@ -140,7 +213,7 @@ def test_the_default_set_is_collected_once(
 ) -> None:
     env = envs.make("antmaze-medium", physics="mujoco")
     monkeypatch.setenv("QDOS_DATA", str(tmp_path / "data"))
-    monkeypatch.setattr(cache.walker, "load", StandIn)
+    monkeypatch.setattr(collect.policies, "ant_walker", StandIn)
     parameters: dict[str, Any] = {"transitions": 400, "degraded_share": 0.5, "noise": 0.2, "num_envs": 2}
     path = cache.default_dataset(env, seed=0, **parameters)
     assert path.parent == tmp_path / "data" and str(path) in capsys.readouterr().out
@@ -149,7 +222,10 @@ def test_the_default_set_is_collected_once(
     assert cache.default_dataset(env, seed=1, **parameters) != path
     dataset = formats.read(path, env)
     assert dataset.size == 400 and dataset.quality is not None
-    assert "wander=" in formats.read_attrs(path)["composition"]
+    attributes = formats.read_attrs(path)
+    assert "wander=" in attributes["composition"] and attributes["recipe"] == "mixed"
+    assert recipes.parse_mix(attributes["mix"]).keys() == recipes.BEHAVIOURS.keys()
+    assert attributes["expert"] == policies.digest(StandIn())
 
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("QDOS_DATA", str(tmp_path / "file"))
@@ -169,7 +245,7 @@ def test_commands_make_info_and_check(
         args = parser.parse_args(["data", *words])
         return args.run(args), capsys.readouterr().out
 
-    monkeypatch.setattr(collect.walker, "load", StandIn)
+    monkeypatch.setattr(collect.policies, "ant_walker", StandIn)
     path = str(tmp_path / "set.hdf5")
     assert run("make", "antmaze-medium", "--out", path, "--transitions", "400", "--num-envs", "2") == (0, f"{path}\n")
     code, text = run("info", path)
@@ -183,3 +259,7 @@ def test_commands_make_info_and_check(
         run("check", path, "--env", "antmaze-medum")
     with pytest.raises(UserError, match=r"\.hdf5"):
         run("make", "antmaze-medium", "--out", str(tmp_path / "set.npz"))
+    with pytest.raises(UserError, match="takes neither"):
+        run("make", "antmaze-medium", "--out", path, "--recipe", "stitch", "--mix", "expert=1")
+    with pytest.raises(UserError, match="give one of them"):
+        run("make", "antmaze-medium", "--out", path, "--degraded-share", "0.1", "--mix", "expert=1")

@@ -11,7 +11,7 @@ import pytest
 
 import envs
 from envs.physics.walls import cells_in_reach
-from qdos_brax.experts import walker
+from qdos_brax.experts import policies
 
 STEPS = 100_000
 NUM_ENVS = 100
@@ -25,7 +25,7 @@ NUM_ENVS = 100
 def test_long_rollouts_stay_plausible(name: str, physics: str) -> None:
     """Half of the ants walk, everything else acts at random; height (m) and speed (m/s) of the body are watched."""
     env = envs.AutoReset(envs.make(name, physics=physics))
-    act = walker.load().act if env.action_size == walker.ACTION_DIM else None
+    act = policies.ant_walker().act if env.spec.family.startswith("ant") else None
     angle = jax.random.uniform(jax.random.key(1), (NUM_ENVS,), minval=-np.pi, maxval=np.pi)
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
 

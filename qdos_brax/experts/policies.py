@@ -1,0 +1,204 @@
+"""Trained experts as policies: (qpos, qvel, commanded direction) to an action. Their weights are shipped, small.
+
+``ant_walker`` and ``humanoid_walker`` walk along the direction, ``ant_dribbler`` takes the ball along it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
+
+from qdos_brax.errors import UserError
+from qdos_brax.experts.views import ANT_NQ, ANT_NV, ball_view, body_view, turned
+from qdos_brax.networks import DiagonalGaussian
+
+RESIDUAL = 1.0
+"""How much of a joint's range the dribbler can add to the walker's action."""
+
+# Where a dribbler heads before it has learned anything: round the ball, then through it; lengths in m.
+_CIRCLE = 1.3  # radius of the circle on which it goes round the ball
+_PULL = 1.1  # turn towards the circle per m beside it
+_LANE = 0.5  # half width of the lane behind the ball in which it pushes
+_FUNNEL = 0.75  # the lane widens by this much per m behind the ball
+_STEER = 2.0  # turn of the push per m of lateral offset
+_OVERRIDE = 1.5  # what is learned can turn the heading to anywhere
+
+
+class Policy(Protocol):
+    """Whatever acts on a state and a direction; ``params`` are the arrays that tell one from another."""
+
+    params: Any
+
+    def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+        """The deterministic action[..., nu] in [-1, 1] of a state [..., nq], [..., nv] for a unit vector[..., 2]."""
+        ...
+
+
+@runtime_checkable
+class Dribbles(Policy, Protocol):
+    """A policy that takes a ball along the direction; its ``walker`` moves the body alone."""
+
+    walker: Policy
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A trained network.
+
+    Attributes:
+        hidden: hidden widths.
+        dim: numbers it gives.
+        params: its parameters.
+        header: how it was trained and what it reaches.
+    """
+
+    hidden: tuple[int, ...]
+    dim: int
+    params: Any
+    header: dict[str, Any]
+
+    def mode(self, observation: jax.Array) -> jax.Array:
+        """The squashed mean[..., dim] in [-1, 1]."""
+        return jnp.tanh(DiagonalGaussian(self.hidden, self.dim).apply(self.params, observation)[0])
+
+
+class Walker:
+    """Walks along the direction; qpos and qvel may go on behind the body's own.
+
+    Args:
+        actor: what was trained.
+        nq: numbers in the body's qpos; its qvel has one less.
+    """
+
+    def __init__(self, actor: Actor, nq: int) -> None:
+        self.actor, self.nq, self.params = actor, nq, actor.params
+
+    def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+        """See ``Policy.act``."""
+        return self.actor.mode(body_view(qpos[..., : self.nq], qvel[..., : self.nq - 1], direction))
+
+
+def dribbler_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+    """[..., 35]: what a dribbler sees, the ant and the ball."""
+    body = body_view(qpos[..., :ANT_NQ], qvel[..., :ANT_NV], direction)
+    return jnp.concatenate([body, ball_view(qpos, qvel, direction)], axis=-1)
+
+
+def dribbler_joints(
+    walker: Policy, qpos: jax.Array, qvel: jax.Array, direction: jax.Array, command: jax.Array
+) -> jax.Array:
+    """The ant's action[..., 8] for a dribbler's ``command[..., 10]``: the walker's along a heading, and corrections.
+
+    Args:
+        walker: walks the ant.
+        qpos: [..., 22].
+        qvel: [..., 20].
+        direction: [..., 2].
+        command: [..., 10]; the first two are added to the heading of ``push_heading``.
+    """
+    offset = ball_view(qpos, qvel, direction)[..., :2]
+    heading = _unit(push_heading(offset) + _OVERRIDE * command[..., :2])
+    back = direction * jnp.array([1.0, -1.0])  # seen along this, what was turned is as it was in the world
+    return jnp.clip(walker.act(qpos, qvel, turned(heading, back)) + RESIDUAL * command[..., 2:], -1.0, 1.0)
+
+
+def push_heading(offset: jax.Array) -> jax.Array:
+    """Unit vector[..., 2] round a ball at ``offset[..., 2]`` to behind it, then through it along +x."""
+    ahead, beside = offset[..., :1], offset[..., 1:]
+    push = _unit(jnp.concatenate([jnp.ones_like(ahead), _STEER * beside], axis=-1))
+    outward = -_unit(offset)
+    side = jnp.where(beside <= 0, 1.0, -1.0)
+    round_it = side * jnp.concatenate([-outward[..., 1:], outward[..., :1]], axis=-1)
+    gap = jnp.linalg.norm(offset, axis=-1, keepdims=True)
+    around = _unit(round_it + _PULL * (_CIRCLE - gap) * outward)
+    return jnp.where((ahead > 0) & (jnp.abs(beside) < _LANE + _FUNNEL * ahead), push, around)
+
+
+def _unit(vector: jax.Array) -> jax.Array:
+    return vector / jnp.maximum(jnp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6)
+
+
+class Dribbler:
+    """Takes the ball along the direction: a steering of the walker, and corrections of its steps.
+
+    Args:
+        actor: what was trained.
+        walker: what it was trained with.
+    """
+
+    def __init__(self, actor: Actor, walker: Policy) -> None:
+        self.actor, self.walker = actor, walker
+        self.params = (actor.params, walker.params)
+
+    def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+        """See ``Policy.act``."""
+        command = self.actor.mode(dribbler_view(qpos, qvel, direction))
+        return dribbler_joints(self.walker, qpos, qvel, direction, command)
+
+
+def ant_walker(path: Path | None = None) -> Walker:
+    """The walking ant, shipped or in ``path``; errors as ``read_actor``."""
+    return Walker(read_actor(path or shipped("ant_walker")), ANT_NQ)
+
+
+def ant_dribbler(path: Path | None = None) -> Dribbler:
+    """The dribbling ant, shipped or in ``path``; errors as ``read_actor``."""
+    return Dribbler(read_actor(path or shipped("ant_dribbler")), ant_walker())
+
+
+def shipped(name: str) -> Path:
+    """Where the weights called ``name`` lie in this package."""
+    return Path(str(resources.files("qdos_brax.experts") / f"{name}.npz"))
+
+
+def digest(policy: Policy) -> str:
+    """Eight hex digits that tell one policy's weights from another's."""
+    sha = hashlib.sha256()
+    for leaf in jax.tree.leaves(policy.params):
+        sha.update(np.asarray(leaf).tobytes())
+    return sha.hexdigest()[:8]
+
+
+def write_actor(path: Path, actor: Actor) -> None:
+    """Writes the weights as plain arrays with a JSON header, atomically."""
+    flat = {"/".join(k): np.asarray(v) for k, v in traverse_util.flatten_dict(actor.params).items()}
+    header = {**actor.header, "hidden": list(actor.hidden)}
+    write_arrays(path, {**flat, "header": np.frombuffer(json.dumps(header).encode(), np.uint8)})
+
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Writes an .npz, whole or not at all."""
+    temporary = path.with_name(path.name + ".tmp")
+    with open(temporary, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+    temporary.replace(path)
+
+
+def read_actor(path: Path) -> Actor:
+    """The weights in ``path``.
+
+    Raises:
+        UserError: the file is missing or holds no weights.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(file["header"].tobytes())
+            flat = {tuple(k.split("/")): jnp.asarray(file[k]) for k in file.files if k != "header"}
+        params = traverse_util.unflatten_dict(flat)
+        last = max(params["params"]["MLP_0"])  # Dense_0, Dense_1, ..
+        dim = params["params"]["MLP_0"][last]["bias"].shape[0] // 2
+        return Actor(tuple(header.pop("hidden")), dim, params, header)
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise UserError(
+            f"cannot read the expert's weights in {path} ({error}); train them with `python -m qdos_brax.experts.train`"
+        ) from error
