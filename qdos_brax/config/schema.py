@@ -39,7 +39,7 @@ class ValuesConfig:
             (implicit Q-learning, the paper's).
         slowness: (graph) the graph is made of those features whose autocorrelation over a segment is at least this.
         max_nodes: (graph) about how many logged states become nodes.
-        neighbours: (graph) jumps from each of them to states of other episodes.
+        neighbours: (graph) jumps from each of them to its nearest, and as many to the nearest of other episodes.
         jump_cost: (graph) cost of a jump, in units of the time in which the data changes as far.
         hidden: widths of the hidden layers of V and Q, and of the advantage of skills.
         learning_rate: Adam's, for these.
@@ -54,8 +54,8 @@ class ValuesConfig:
     estimator: str = choice("graph", "graph", "iql")
     slowness: float = number(0.9, high=1.0, scan=False)
     max_nodes: int = count(20_000)
-    neighbours: int = count(10)
-    jump_cost: float = number(1.5, above=True, scan=False)
+    neighbours: int = count(20)
+    jump_cost: float = number(1.0, above=True, scan=False)
     hidden: tuple[int, ...] = widths(256, 256)
     learning_rate: Scannable = rate(3e-4)
     batch_size: int = count(256)

@@ -49,11 +49,16 @@ class GraphPhase:
         return jnp.tile(-jnp.asarray(costs), (self._members, 1)), found
 
     def finish(self, state: jax.Array, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Adds the scaled advantage of every segment, float32[members, S]."""
+        """Adds the scaled advantage of every segment, float32[members, S].
+
+        Data goes on after a success, and so does this task: to stay there costs nothing, to leave it is a loss. Where
+        an episode ends, the value after its last row is that row's, for the state behind it is no row of the data.
+        """
         value = state[0]
-        # The value after an episode's last row is that row's: the state behind it is no row of the data.
         following = jnp.where(self._ends, value, jnp.roll(value, -1))
-        advantage = segment_advantages(value, following, self._data, self._skills.horizon, jnp.ones(()))
+        costs = jnp.asarray(step_costs(np.asarray(self._data.rewards)), value.dtype)
+        endless = self._data.replace(rewards=-costs, masks=jnp.ones_like(costs))
+        advantage = segment_advantages(value, following, endless, self._skills.horizon, jnp.ones(()))
         scaled = scaled_advantage(advantage, self._skills.advantage_scale)
         return artifacts | {"advantage": jnp.tile(scaled, (self._members, 1))}
 

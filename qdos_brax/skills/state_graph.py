@@ -1,8 +1,9 @@
 """How far every logged state is from success: shortest paths on a graph of logged states.
 
 Nodes are states at regular intervals along the episodes. An episode's own steps lead from node to node at what they
-cost; between neighbours of different episodes one may jump, at the cost of the time in which the data changes as far.
-So ways are put together from pieces of many episodes. Distances are not discounted: far from the goal a step forward
+cost; between neighbours one may jump, at the cost of the time in which the data changes as far: to those of other
+episodes, so that ways are put together from pieces of many, and to the nearest of all, mostly of the same episode, so
+that a walk in circles is not taken for the only way. Distances are not discounted: far from the goal a step forward
 counts as much as near it.
 
 Related: planning on a graph of replayed states (Eysenbach et al. 2019, SoRB), values on a graph of clustered states
@@ -50,7 +51,7 @@ def costs_to_go(
         costs: float[N], >= 0, of the step that leaves the row; 0 where there is nothing left to reach.
         ends: bool[N], the last row of each episode.
         max_nodes: about how many rows become nodes; the rows between two nodes are interpolated.
-        neighbours: jumps from every node, to the nearest nodes of other episodes.
+        neighbours: jumps from every node to the nearest nodes of all, and as many to the nearest of other episodes.
         jump_cost: steps per unit of distance.
 
     Returns:
@@ -67,7 +68,7 @@ def costs_to_go(
     count = min(neighbours, len(nodes) - np.bincount(episode[nodes]).max())  # every node has so many others at least
     if count > 0:
         near, distance = _neighbours(features[nodes], episode[nodes], count)
-        here = np.repeat(np.arange(len(nodes)), count)
+        here = np.repeat(np.arange(len(nodes)), near.shape[1])
         there, steps, rate = near.ravel(), jump_cost * distance.ravel(), costs[nodes]
         edges += [(here, there, rate[here] * steps), (there, here, rate[there] * steps)]
     return _interpolated(_to_goal(edges, costs[nodes] == 0), nodes, episode, costs)
@@ -90,15 +91,17 @@ def _nodes(costs: np.ndarray, ends: np.ndarray, episode: np.ndarray, max_nodes: 
 
 
 def _neighbours(points: np.ndarray, episode: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices[M, count] of the nearest points of other episodes, and their distances[M, count]."""
+    """Indices[M, 2 count] of the nearest points of all, then of other episodes, and their distances[M, 2 count]."""
     points = np.asarray(points, np.float32)
     square = np.square(points).sum(axis=1)
 
     def block(first: int) -> np.ndarray:
-        rows = slice(first, first + _BLOCK)
+        rows = np.arange(first, min(first + _BLOCK, len(points)))
         order = square - 2 * points[rows] @ points.T  # the squared distance but for a constant per row
+        order[np.arange(len(rows)), rows] = np.inf
+        nearest = np.argpartition(order, count - 1, axis=1)[:, :count]
         order[episode[rows, None] == episode] = np.inf
-        return np.argpartition(order, count - 1, axis=1)[:, :count]
+        return np.concatenate([nearest, np.argpartition(order, count - 1, axis=1)[:, :count]], axis=1)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         near = np.concatenate(list(pool.map(block, range(0, len(points), _BLOCK))))

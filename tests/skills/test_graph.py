@@ -158,18 +158,17 @@ def test_advantages_tell_who_gains_ground_far_from_the_goal_too(plane):
     assert auc(advantage[far], gain[far] > 0) > 0.95
 
 
-def test_the_advantage_is_the_undiscounted_return_plus_the_change_of_value(plane):
+def test_the_advantage_is_the_change_of_value_less_the_cost_of_getting_there(plane):
+    """Leaving the goal counts as a loss: masks, which say where an episode would have ended, do not matter."""
     config, dataset, value, advantage = plane
     horizon, starts = config.skills.horizon, segment_starts(dataset.ends, config.skills.horizon)
     raw = []
     for start in starts[:2000]:
-        total, alive = 0.0, True
-        for row in range(start, start + horizon):
-            total += dataset.rewards[row] * alive
-            alive = alive and dataset.masks[row] > 0
         after = start + horizon - (1 if dataset.ends[start + horizon - 1] else 0)
-        raw.append(total + alive * value[after] - value[start])
+        raw.append(sum(dataset.rewards[start : start + horizon]) + value[after] - value[start])
     assert spearmanr(raw, advantage[:2000]).statistic > 0.9999
+    leaving = (dataset.masks[starts] == 0) & (value[starts + horizon - 1] < -2)
+    assert leaving.sum() > 20 and advantage[leaving].max() < np.median(advantage)
 
 
 def test_a_second_search_finds_the_same_bit_for_bit(plane):
