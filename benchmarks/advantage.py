@@ -1,8 +1,9 @@
 """Do the weights know which segments gain ground? ``python benchmarks/advantage.py --env antmaze-medium --out FILE``.
 
-Trains the values (and, for the latent estimator, the skills) as a run would, and ranks all segments of the data by each
-of the three advantages. The truth, which training never sees, is how much of the shortest path to the task's goal a
-segment gains. Prints one row per estimator and writes CSV.
+Trains the values (and, for the latent advantage, the skills) as a run would, and ranks all segments of the data by each
+advantage. The truth, which training never sees, is how much of the shortest path to the task's goal a segment gains.
+Prints one row per value estimator, advantage and lambda, next to uniform weights and to the true distance in V's place,
+and writes CSV.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import argparse
 import csv
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,13 +24,26 @@ from qdos_brax.data import cache, formats, quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, macro_rows, to_device
 from qdos_brax.data.segments import window
+from qdos_brax.methods.build import value_phase
+from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.segment_weights import LatentWeights, SegmentBatch
 from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.vae import Segments, SkillModel
-from qdos_brax.skills.value_phase import ValuePhase
+from qdos_brax.skills.value_phase import ValuePhase, over_rows
 from qdos_brax.skills.values import IQL
-from qdos_brax.skills.weights import advantage_weights
+from qdos_brax.skills.weights import advantage_weights, scaled_advantage
 from qdos_brax.train_flow import prepare_jax
+
+CONFIGURED = {"graph": ("segment", "latent"), "iql": ("segment", "latent", "transition")}
+"""Advantages by value estimator."""
+
+
+class Scores(NamedTuple):
+    """Every segment's score[S]; correlation of V with minus the true distance; seconds that the values took."""
+
+    score: np.ndarray
+    correlation: float
+    seconds: float
 
 
 def run_phase(phase: Any, seed: int, artifacts: dict[str, Any]) -> Any:
@@ -37,55 +51,97 @@ def run_phase(phase: Any, seed: int, artifacts: dict[str, Any]) -> Any:
     state = phase.init(jax.random.split(jax.random.key(seed), 1), artifacts)
     for _ in range(phase.num_chunks):
         state, _ = phase.chunk(state)
-    return state
+    return jax.block_until_ready(state)
 
 
-def advantages(config: configs.Config, env: Any, data: DeviceData, seed: int) -> dict[str, np.ndarray]:
-    """float[S] of every segment, by estimator."""
+def scores(
+    config: configs.Config, env: Any, dataset: Dataset, data: DeviceData, seed: int, advantages: list[str]
+) -> dict[str, Scores]:
+    """By advantage, those of ``advantages`` that ``config.values.estimator`` has; as scaled by the configuration."""
+    found: dict[str, Scores] = {}
     hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
-    skills, discount = config.skills, hyper["values.discount"][0]
-    iql = IQL(env.observation_size, env.action_size, config.values.hidden)
-    phase = ValuePhase(config, data, hyper, iql)
-    state = run_phase(phase, seed, {})
-    values = jax.tree.map(lambda x: x[0], state.values)
-    found = {
-        "segment": np.asarray(jax.jit(phase.segment)(values, data, discount)),
-        "transition": np.asarray(jax.jit(phase.transition)(values, data, discount)),
-    }
+    for name in advantages:
+        if name not in CONFIGURED[config.values.estimator]:
+            continue
+        chosen = configs.replace(config, **{"skills.advantage": name})
+        if name == "transition" or not found:  # segment and latent share their values
+            started = time.perf_counter()
+            phase = value_phase(chosen, env, dataset, data, hyper)
+            state = run_phase(phase, seed, {})
+            artifacts = phase.finish(state, {})
+            seconds = time.perf_counter() - started
+            fit = correlation(env, dataset, state_values(chosen, env, data, phase, state))
+        score = np.asarray(artifacts["advantage"][0])
+        if name == "latent":
+            score = latent_scores(chosen, env, data, hyper, artifacts, seed)
+        found[name] = Scores(score, fit, seconds)
+    return found
 
+
+def state_values(
+    config: configs.Config, env: Any, data: DeviceData, phase: GraphPhase | ValuePhase, state: Any
+) -> np.ndarray:
+    """V of every logged state, [N]."""
+    if isinstance(phase, GraphPhase):
+        return np.asarray(state[0])
+    iql = IQL(env.observation_size, env.action_size, config.values.hidden)
+    params = jax.tree.map(lambda x: x[0], state.values.value)
+    return np.asarray(jax.jit(lambda p: over_rows(lambda s: iql.value(p, s), data.observations))(params))
+
+
+def correlation(env: Any, dataset: Dataset, values: np.ndarray) -> float:
+    """Pearson's, between V and minus the true distance, over the states that have one."""
+    distance = np.asarray(env.true_distance(dataset.qpos), np.float64)
+    known = np.isfinite(distance)
+    return float(np.corrcoef(values[known], -distance[known])[0, 1]) if values.std() > 0 else float("nan")
+
+
+def latent_scores(
+    config: configs.Config, env: Any, data: DeviceData, hyper: Any, artifacts: Any, seed: int
+) -> np.ndarray:
+    """Q(s_0, z) - V(s_0) of every segment, after a skill phase without rollouts in which Q learned along."""
+    skills = config.skills
     model = SkillModel(env.observation_size, env.action_size, skills.latent_dim, skills.encoder_hidden,
                        skills.encoder_layers, skills.decoder_hidden, skills.prior_hidden)  # fmt: skip
-    weights = LatentWeights(env.observation_size, skills.latent_dim, config.values.hidden, iql.value, skills.horizon)
-    artifacts = phase.finish(state, {})
+    weights = LatentWeights(env.observation_size, skills.latent_dim, config.values.hidden, skills.advantage_scale)
     learned = run_phase(SkillPhase(config, data, hyper, model, weights, None), seed, artifacts)
     learned = jax.tree.map(lambda x: x[0], learned)
-    value = jax.tree.map(lambda x: x[0], artifacts["value"])
 
     @jax.jit
     def latent(index: jax.Array) -> jax.Array:
-        rows = macro_rows(data, data.starts[index], skills.horizon, discount)
+        rows = macro_rows(data, data.starts[index], skills.horizon, hyper["values.discount"][0])
         segments = Segments(*window((data.observations, data.actions), data.starts[index], skills.horizon))
         batch = SegmentBatch(index, rows, lambda: model.encode(learned.params, segments).mean)
-        return weights.raw_advantage(learned.weights, batch, {"value": value})
+        return weights.smaller_head(learned.weights, batch)
 
     total = data.starts.shape[0]
     blocks = [jnp.arange(first, min(first + 4096, total)) for first in range(0, total, 4096)]
-    return found | {"latent": np.concatenate([np.asarray(latent(block)) for block in blocks])}
+    return np.concatenate([np.asarray(latent(block)) for block in blocks])
 
 
 def rows_of(
-    config: configs.Config, env: Any, dataset: Dataset, found: dict[str, np.ndarray], starts: np.ndarray
+    config: configs.Config,
+    env: Any,
+    dataset: Dataset,
+    starts: np.ndarray,
+    found: dict[tuple[str, str], Scores],
+    temperatures: list[float],
 ) -> list[dict[str, Any]]:
-    """One row per estimator, with the uniform weights and the true distance beside them."""
+    """One row per estimator, advantage and lambda, with uniform weights and the true distance beside them."""
     gains = quality.progress(env, dataset, starts, config.skills.horizon)
     degraded = None if dataset.quality is None else dataset.quality[starts] != quality.QUALITY["navigate"]
-    scored = found | {"uniform": np.zeros(len(starts)), "true progress": gains}
+    ceiling = {("uniform", "none"): Scores(np.zeros(len(starts)), float("nan"), 0.0)}
+    ceiling |= {("true distance", "segment"): Scores(gains, 1.0, 0.0)}
     rows = []
-    for name, scores in scored.items():
-        spread = scores / (scores.std() + 1e-6)
-        temperature, clip = np.mean(config.skills.advantage_temperature), np.mean(config.skills.weight_clip)
-        weights = np.asarray(advantage_weights(jnp.asarray(spread), float(temperature), float(clip)))
-        rows.append({"estimator": name, **quality.report(scores, weights, gains, degraded)})
+    for (values, advantage), (score, value_correlation, seconds) in (found | ceiling).items():
+        scaled = scaled_advantage(jnp.asarray(score), config.skills.advantage_scale)
+        for temperature in [1.0] if values == "uniform" else temperatures:
+            weights = np.asarray(advantage_weights(scaled, temperature, float(np.mean(config.skills.weight_clip))))
+            rows.append(
+                {"values": values, "advantage": advantage, "lambda": temperature}
+                | quality.report(score, weights, gains, degraded)
+                | {"value_correlation": value_correlation, "values_seconds": round(seconds, 1)}
+            )
     return rows
 
 
@@ -96,7 +152,10 @@ def main() -> None:
     parser.add_argument("--preset", default="cpu")
     parser.add_argument("--dataset", type=Path, help="default: the task's own set")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--set", action="append", default=[])
+    parser.add_argument("--values", default="graph,iql", help="value estimators, comma-separated")
+    parser.add_argument("--advantages", default="segment,latent,transition", help="comma-separated")
+    parser.add_argument("--lambdas", default="0.3,0.5,0.7,1.0", help="temperatures of the weight, comma-separated")
+    parser.add_argument("--set", action="append", default=[], help="key=value of the configuration")
     parser.add_argument("--out", type=Path, help="CSV file, appended to")
     args = parser.parse_args()
     prepare_jax()
@@ -109,18 +168,24 @@ def main() -> None:
     )
     dataset = formats.read(path, env)
     data, _ = to_device(dataset, config.skills.horizon)
-    found = advantages(config, env, data, args.seed)
-    rows = rows_of(config, env, dataset, found, np.asarray(data.starts))
+    found: dict[tuple[str, str], Scores] = {}
+    for values in args.values.split(","):
+        chosen = configs.replace(config, **{"values.estimator": values})
+        by_name = scores(chosen, env, dataset, data, args.seed, args.advantages.split(","))
+        found |= {(values, name): score for name, score in by_name.items()}
+    temperatures = [float(text) for text in args.lambdas.split(",")]
+    rows = rows_of(config, env, dataset, np.asarray(data.starts), found, temperatures)
     head = {
         "env": env.spec.full_name,
         "seed": args.seed,
         "transitions": dataset.size,
-        "values_updates": config.values.updates,
+        "degraded_share": share(dataset),
+        "scale": config.skills.advantage_scale,
     }
     for row in rows:
         print(
             "  ".join(
-                f"{key} {value:.3f}" if isinstance(value, float) else f"{value:14s}" for key, value in row.items()
+                f"{key} {value:.3f}" if isinstance(value, float) else f"{value:13s}" for key, value in row.items()
             )
         )
     print(f"{time.perf_counter() - started:.0f} s")
@@ -131,6 +196,13 @@ def main() -> None:
             if new:
                 writer.writeheader()
             writer.writerows({**head, **row} for row in rows)
+
+
+def share(dataset: Dataset) -> float:
+    """The share of the rows that come from degraded behaviour, to two digits; NaN where nobody knows."""
+    if dataset.quality is None:
+        return float("nan")
+    return round(float(np.mean(dataset.quality != quality.QUALITY["navigate"])), 2)
 
 
 if __name__ == "__main__":

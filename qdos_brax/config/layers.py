@@ -187,3 +187,5 @@ def _check_together(config: Config) -> None:
             f"high_level.env_steps ({high.env_steps}) is less than one macro step of every environment "
             f"({config.skills.horizon} x {high.num_envs}); raise it with --steps"
         )
+    if config.skills.advantage == "transition" and config.values.estimator == "graph":
+        raise UserError("skills.advantage=transition needs values.estimator=iql; on a graph it is the same as segment")

@@ -32,22 +32,33 @@ class DataConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ValuesConfig:
-    """Implicit Q-learning on the data: Q, V, and from them the segments' advantages.
+    """What a state is worth, and from it the segments' advantages.
 
     Attributes:
-        hidden: widths of the hidden layers of Q and V.
-        batch_size: transitions per gradient step.
-        learning_rate: Adam's.
-        expectile: tau of the expectile regression of V.
-        discount: per environment step.
-        target_rate: Polyak rate of the target critic.
-        n_step: environment steps of the bootstrapped return.
-        updates: gradient steps.
+        estimator: "graph" (undiscounted steps to success along shortest paths on a graph of logged states) or "iql"
+            (implicit Q-learning, the paper's).
+        slowness: (graph) the graph is made of those features whose autocorrelation over a segment is at least this.
+        max_nodes: (graph) about how many logged states become nodes.
+        neighbours: (graph) jumps from each of them to its nearest, and as many to the nearest of other episodes.
+        jump_cost: (graph) cost of a jump, in units of the time in which the data changes as far.
+        hidden: widths of the hidden layers of V and Q, and of the advantage of skills.
+        learning_rate: Adam's, for these.
+        batch_size: (iql) transitions per gradient step.
+        expectile: (iql) tau of the expectile regression of V.
+        discount: (iql) per environment step.
+        target_rate: (iql) Polyak rate of the target critic.
+        n_step: (iql) environment steps of the bootstrapped return.
+        updates: (iql) gradient steps.
     """
 
+    estimator: str = choice("graph", "graph", "iql")
+    slowness: float = number(0.9, high=1.0, scan=False)
+    max_nodes: int = count(20_000)
+    neighbours: int = count(20)
+    jump_cost: float = number(1.0, above=True, scan=False)
     hidden: tuple[int, ...] = widths(256, 256)
-    batch_size: int = count(256)
     learning_rate: Scannable = rate(3e-4)
+    batch_size: int = count(256)
     expectile: Scannable = number(0.9, high=1.0, above=True)
     discount: Scannable = number(0.99, high=1.0)
     target_rate: Scannable = number(0.005, high=1.0, above=True)
@@ -71,7 +82,10 @@ class SkillsConfig:
         kl_weight: beta, the weight of KL(posterior || prior).
         kl_weighted: whether the advantage weight multiplies the KL too (Algorithm 1) or not (equation 4).
         advantage: estimator of a segment's advantage; "segment" is the H-step return plus V(s_H) minus V(s_0),
-            "latent" is Q(s_0, z) - V(s_0), "transition" is the mean of Q(s_t, a_t) - V(s_t).
+            "latent" is Q(s_0, z) - V(s_0), "transition" is the mean of Q(s_t, a_t) - V(s_t) (iql only: on a graph it
+            is the same as "segment").
+        advantage_scale: what A is before it is divided by lambda: "rank" (normal scores of the advantages, so that
+            their distribution does not matter) or "std" (advantages over their standard deviation).
         advantage_temperature: lambda in exp(A / lambda).
         weight_clip: largest weight, after the batch's weights were brought to mean 1.
         alpha: weight of the mutual-information loss.
@@ -94,6 +108,7 @@ class SkillsConfig:
     kl_weight: Scannable = number(0.1)
     kl_weighted: bool = flag(True)
     advantage: str = choice("segment", "segment", "latent", "transition")
+    advantage_scale: str = choice("rank", "rank", "std")
     advantage_temperature: Scannable = number(1.0, above=True)
     weight_clip: Scannable = number(20.0, low=1.0)
     alpha: Scannable = number(0.2)
@@ -211,7 +226,7 @@ class Config:
         dataset: a data file, or None to collect the task's default set.
         out: the run folder, or None to name one under ``run.root``.
         data: collection.
-        values: implicit Q-learning.
+        values: values of states.
         skills: trajectory VAE.
         labels: pseudo-labels.
         high_level: online learner.

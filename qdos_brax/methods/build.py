@@ -30,6 +30,7 @@ from qdos_brax.population import over_members
 from qdos_brax.runs.checkpoint import final_artifacts
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import Phase
+from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, SegmentWeights, UniformWeights
 from qdos_brax.skills.skill_phase import Information, SkillPhase
@@ -62,18 +63,25 @@ def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
         )
     hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
     model = _skill_model(config, env)
-    iql = IQL(env.observation_size, env.action_size, config.values.hidden)
-    weights = _weights(config, recipe, iql, env)
+    weights = _weights(config, recipe, env)
     information = _information(config, recipe, env, model, normaliser, data)
     labeller = _labeller(config, recipe, env)
 
-    values: list[Phase] = [ValuePhase(config, data, hyper, iql)] if recipe.weighted else []
     return [
-        *values,
+        *([value_phase(config, env, dataset, data, hyper)] if recipe.weighted else []),
         SkillPhase(config, data, hyper, model, weights, information),
         LabelPhase(config, data, hyper, model, partial(latent_map, config.high_level.latent_map)),
         OnlinePhase(config, env, data, normaliser, hyper, model, labeller),
     ]
+
+
+def value_phase(
+    config: Config, env: Any, dataset: Dataset, data: DeviceData, hyper: dict[str, jax.Array]
+) -> GraphPhase | ValuePhase:
+    """The phase that finds the segments' advantages, by ``config.values.estimator``."""
+    if config.values.estimator == "graph":
+        return GraphPhase(config.values, config.skills, data, dataset.ends, len(configs.members(config)))
+    return ValuePhase(config, data, hyper, IQL(env.observation_size, env.action_size, config.values.hidden))
 
 
 class TrainedRun(NamedTuple):
@@ -181,14 +189,13 @@ def _skill_model(config: Config, env: Any) -> SkillModel:
     )
 
 
-def _weights(config: Config, recipe: Recipe, iql: IQL, env: Any) -> SegmentWeights:
+def _weights(config: Config, recipe: Recipe, env: Any) -> SegmentWeights:
     if not recipe.weighted:
         return UniformWeights()
     if config.skills.advantage != "latent":
         return LoggedWeights()
-    return LatentWeights(
-        env.observation_size, config.skills.latent_dim, config.values.hidden, iql.value, config.skills.horizon
-    )
+    skills = config.skills
+    return LatentWeights(env.observation_size, skills.latent_dim, config.values.hidden, skills.advantage_scale)
 
 
 def _information(

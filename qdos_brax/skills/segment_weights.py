@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from qdos_brax.data.device import MacroRows
 from qdos_brax.high_level.sac import ADAM, adam_step
 from qdos_brax.networks import Ensemble
-from qdos_brax.skills.weights import latent_advantage
+from qdos_brax.skills.weights import scaled_advantage
 
 
 class SegmentBatch(NamedTuple):
@@ -33,7 +33,7 @@ class SegmentBatch(NamedTuple):
 
 
 class SegmentWeights(Protocol):
-    """A source of advantages. ``artifacts`` are the value phase's: "value" and "advantage"."""
+    """A source of advantages. ``artifacts`` is the value phase's: "advantage", scaled, of all segments."""
 
     def init(self, key: jax.Array) -> Any:
         """What it carries between gradient steps."""
@@ -44,7 +44,7 @@ class SegmentWeights(Protocol):
         ...
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
-        """Advantages[B], in units of their spread."""
+        """Advantages[B], scaled (``scaled_advantage``)."""
         ...
 
 
@@ -73,55 +73,47 @@ class LoggedWeights(UniformWeights):
 
 
 class LatentWeights:
-    """Algorithm 1: Q(s_0, z) - V(s_0), with Q regressed on the H-step return along with the skills.
+    """Algorithm 1: Q(s_0, z) - V(s_0), learned along with the skills.
+
+    Q is V(s_0) + f(s_0, z), and f is regressed on the logged H-step advantages, which is to regress Q on the H-step
+    returns: a whole Q would have to be known to a hundredth before its difference from V says anything.
 
     Args:
         observation_dim: width of observations.
         latent_dim: dimension of z.
-        hidden: hidden widths of Q.
-        value: V as a function of (parameters, observations).
-        horizon: H, the power of the discount in front of V(s_H).
+        hidden: hidden widths of f.
+        scale: of the advantages (``scaled_advantage``).
     """
 
-    def __init__(
-        self,
-        observation_dim: int,
-        latent_dim: int,
-        hidden: Sequence[int],
-        value: Callable[[Any, jax.Array], jax.Array],
-        horizon: int,
-    ) -> None:
+    def __init__(self, observation_dim: int, latent_dim: int, hidden: Sequence[int], scale: str) -> None:
         self._width = observation_dim + latent_dim
-        self._q = Ensemble(tuple(hidden), size=2)
-        self._value, self._horizon = value, horizon
+        self._gain = Ensemble(tuple(hidden), size=2)
+        self._scale = scale
 
     def init(self, key: jax.Array) -> dict[str, Any]:
-        """Fresh parameters of Q and Adam's moments."""
-        params = self._q.init(key, jnp.zeros((1, self._width)))
+        """Fresh parameters of f's two heads and Adam's moments."""
+        params = self._gain.init(key, jnp.zeros((1, self._width)))
         return {"params": params, "moments": ADAM.init(params)}
 
     def learn(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any], hyper: dict[str, Any]) -> Any:
-        """Regresses both heads on r_0 + .. + gamma^H V(s_H)."""
-        bootstrap = self._value(artifacts["value"], batch.rows.next_observation)
-        target = batch.rows.reward + hyper["values.discount"] ** self._horizon * batch.rows.mask * bootstrap
+        """Regresses both heads on the segments' own advantages."""
+        target = artifacts["advantage"][batch.segment]
         inputs = self._inputs(batch)
 
         def loss(params: Any) -> jax.Array:
-            return jnp.mean(jnp.sum((self._q.apply(params, inputs) - target) ** 2, axis=0))
+            return jnp.mean(jnp.sum((self._gain.apply(params, inputs) - target) ** 2, axis=0))
 
         grads = jax.grad(loss)(state["params"])
         params, moments = adam_step(state["params"], state["moments"], grads, hyper["values.learning_rate"])
         return {"params": params, "moments": moments}
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
-        """``raw_advantage`` over the batch's standard deviation."""
-        advantage = self.raw_advantage(state, batch, artifacts)
-        return advantage / (jnp.std(advantage) + 1e-6)
+        """``smaller_head``, scaled over the batch."""
+        return scaled_advantage(self.smaller_head(state, batch), self._scale)
 
-    def raw_advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
-        """Smaller head of Q minus V, [B], in units of reward."""
-        q = self._q.apply(state["params"], self._inputs(batch)).min(axis=0)
-        return latent_advantage(q, self._value(artifacts["value"], batch.rows.observation))
+    def smaller_head(self, state: Any, batch: SegmentBatch) -> jax.Array:
+        """The smaller of the two heads of Q minus V, [B], on the scale of the logged advantages."""
+        return self._gain.apply(state["params"], self._inputs(batch)).min(axis=0)
 
     def _inputs(self, batch: SegmentBatch) -> jax.Array:
         return jax.lax.stop_gradient(jnp.concatenate([batch.rows.observation, batch.latent()], axis=-1))

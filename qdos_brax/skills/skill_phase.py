@@ -94,7 +94,7 @@ class SkillPhase:
                 key, params, ADAM.init(params), self._weights.init(weights_key), jnp.zeros((), jnp.int32)
             )
 
-        self._artifacts = {name: artifacts[name] for name in ("value", "advantage") if name in artifacts}
+        self._artifacts = {name: artifacts[name] for name in ("advantage",) if name in artifacts}
         return jax.vmap(one)(key)
 
     def chunk(self, state: SkillPhaseState) -> tuple[SkillPhaseState, dict[str, np.ndarray]]:

@@ -1,4 +1,4 @@
-"""The first phase: values of states, and from them the advantage of every segment of the data."""
+"""The first phase with implicit Q-learning: values, and from them the advantage of every segment of the data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import macro_return, window
 from qdos_brax.population import over_members
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState
-from qdos_brax.skills.weights import segment_advantage, transition_advantage
+from qdos_brax.skills.weights import scaled_advantage, segment_advantage, transition_advantage
 
 LABEL_BATCH = 2048
 
@@ -70,9 +70,8 @@ class ValuePhase:
         return state, {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
 
     def finish(self, state: ValuePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Adds the value function and the advantage of every segment, float32[members, S], in units of its spread."""
-        advantage = self._advantages(state, self._hyper, self._data)
-        return artifacts | {"value": state.values.value, "advantage": advantage}
+        """Adds the scaled advantage of every segment, float32[members, S]."""
+        return artifacts | {"advantage": self._advantages(state, self._hyper, self._data)}
 
     def _train(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> Any:
         value_hyper = ValueHyper(hyper["values.learning_rate"], hyper["values.expectile"], hyper["values.target_rate"])
@@ -87,18 +86,14 @@ class ValuePhase:
         return state, jax.tree.map(jnp.mean, info)
 
     def _all_advantages(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> jax.Array:
-        estimate = self.segment if self._skills.advantage == "segment" else self.transition
-        advantage = estimate(state.values, data, hyper["values.discount"])
-        return advantage / (jnp.std(advantage) + 1e-6)
+        estimate = self.transition if self._skills.advantage == "transition" else self.segment
+        return scaled_advantage(estimate(state.values, data, hyper["values.discount"]), self._skills.advantage_scale)
 
     def segment(self, values: ValueState, data: DeviceData, discount: jax.Array) -> jax.Array:
         """sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of every window at ``data.starts``, [S]."""
-        horizon = self._skills.horizon
-        reward, mask = macro_return(*window((data.rewards, data.masks), data.starts, horizon), discount)
         value = partial(self._iql.value, values.value)
-        value_start = over_rows(value, data.observations)[data.starts]
-        value_end = over_rows(value, data.next_observations)[data.starts + horizon - 1]
-        return segment_advantage(reward, mask * discount**horizon, value_end, value_start)
+        before, after = over_rows(value, data.observations), over_rows(value, data.next_observations)
+        return segment_advantages(before, after, data, self._skills.horizon, discount)
 
     def transition(self, values: ValueState, data: DeviceData, discount: jax.Array) -> jax.Array:
         """mean_t [min Q(s_t, a_t) - V(s_t)] of every window at ``data.starts``, [S]."""
@@ -109,6 +104,23 @@ class ValuePhase:
 
         q, value = over_rows(gap, data.observations, data.actions)
         return transition_advantage(*window((q, value), data.starts, self._skills.horizon))
+
+
+def segment_advantages(
+    value: jax.Array, next_value: jax.Array, data: DeviceData, horizon: int, discount: jax.Array
+) -> jax.Array:
+    """sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of every window of ``horizon`` rows at ``data.starts``, [S].
+
+    Args:
+        value: [N], V of every row's state.
+        next_value: [N], V of the state after it.
+        data: the data set.
+        horizon: H.
+        discount: gamma.
+    """
+    reward, mask = macro_return(*window((data.rewards, data.masks), data.starts, horizon), discount)
+    value_end = next_value[data.starts + horizon - 1]
+    return segment_advantage(reward, mask * discount**horizon, value_end, value[data.starts])
 
 
 def over_rows(function: Callable[..., Any], *arrays: jax.Array) -> Any:

@@ -1,9 +1,10 @@
-"""How much a segment counts: three estimates of its advantage, and the weight made of it."""
+"""How much a segment counts: three estimates of its advantage, its scale, and the weight made of it."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import ndtri
 
 
 def segment_advantage(
@@ -18,16 +19,34 @@ def transition_advantage(q: jax.Array, value: jax.Array) -> jax.Array:
     return jnp.mean(q - value, axis=-1)
 
 
-def latent_advantage(q: jax.Array, value_start: jax.Array) -> jax.Array:
-    """The paper's Algorithm 1: Q(s_0, z) - V(s_0), [B]."""
-    return q - value_start
+def scaled_advantage(advantage: jax.Array, scale: str) -> jax.Array:
+    """Advantages[B] on a scale that does not depend on their unit, about mean square 1.
+
+    Args:
+        advantage: [B], in units of reward.
+        scale: "rank", their normal scores, or "std", in units of their standard deviation.
+    """
+    if scale == "rank":
+        return normal_scores(advantage)
+    return advantage / (jnp.std(advantage) + 1e-6)
+
+
+def normal_scores(x: jax.Array) -> jax.Array:
+    """The quantile of the standard normal distribution at each x[B]'s mid-rank (van der Waerden; Bliss 1967).
+
+    Weights exp(score / lambda) of a large batch then have effective sample share exp(-1 / lambda^2), whatever x's
+    distribution; a few outliers cannot take all the weight. Equal x get equal scores, all equal x get 0.
+    """
+    ordered = jnp.sort(x)
+    below, up_to = jnp.searchsorted(ordered, x, side="left"), jnp.searchsorted(ordered, x, side="right")
+    return ndtri((below + up_to) / (2 * x.shape[0]))
 
 
 def advantage_weights(advantage: jax.Array, temperature: jax.Array | float, clip: jax.Array | float) -> jax.Array:
     """exp(A / lambda), normalised over the batch to mean 1, clipped above (paper, eq. 2).
 
     Args:
-        advantage: [B], already divided by its scale over the dataset if lambda is meant in units of that scale.
+        advantage: [B], on the scale that lambda is meant for (``scaled_advantage``).
         temperature: lambda > 0.
         clip: the largest weight after normalisation.
 

@@ -136,6 +136,7 @@ def value_phase(config):
 def values():
     config = point_config(
         **{
+            "values.estimator": "iql",
             "values.updates": 1000,
             "values.learning_rate": 1e-3,
             "values.discount": 0.9,
@@ -170,8 +171,7 @@ def test_weighted_skills_learn_the_weighted_behaviour(values):
 
 def test_latent_weights_learn_along(values):
     config, _, _, _, artifacts = values
-    iql = IQL(2, 2, (64, 64))
-    weights = LatentWeights(2, 2, (64, 64), iql.value, config.skills.horizon)
+    weights = LatentWeights(2, 2, (64, 64), "rank")
     _, _, _, _, metrics, _ = train_skills(config, weights, artifacts=artifacts)
     assert 0.1 < float(metrics["weight_ess"][0]) < 0.99 and np.isfinite(metrics["vae_loss"]).all()
 

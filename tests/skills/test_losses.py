@@ -8,7 +8,13 @@ import pytest
 from qdos_brax.networks import gaussian_kl, gaussian_sample
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.values import IQL, ValueBatch, expectile_loss
-from qdos_brax.skills.weights import advantage_weights, latent_advantage, segment_advantage, transition_advantage
+from qdos_brax.skills.weights import (
+    advantage_weights,
+    normal_scores,
+    scaled_advantage,
+    segment_advantage,
+    transition_advantage,
+)
 
 
 def test_expectile_loss_by_hand():
@@ -40,7 +46,25 @@ def test_advantages_by_hand():
     np.testing.assert_allclose(
         transition_advantage(jnp.array([[1.0, 2.0, 3.0]]), jnp.array([[0.0, 3.0, 3.0]])), [0.0], atol=1e-7
     )
-    np.testing.assert_allclose(latent_advantage(jnp.array([3.0]), jnp.array([1.0])), [2.0])
+
+
+def test_normal_scores_by_hand():
+    # Mid-ranks of 4 lie at 1/8, 3/8, 5/8, 7/8; the normal quantiles there are -1.15035, -0.31864 and their mirrors.
+    scores = normal_scores(jnp.array([1e6, -3.0, 0.0, 0.1]))
+    np.testing.assert_allclose(scores, [1.15035, -1.15035, -0.31864, 0.31864], atol=1e-4)
+    np.testing.assert_allclose(normal_scores(jnp.array([5.0, 5.0, 7.0])), [-0.43073, -0.43073, 0.96742], atol=1e-4)
+    np.testing.assert_allclose(normal_scores(jnp.full(5, -20.0)), 0.0, atol=1e-6)
+
+
+def test_rank_scaled_weights_keep_their_effective_share_whatever_the_tails():
+    # exp(x / lambda) of a standard normal x: (E w)^2 / E w^2 = exp(-1 / lambda^2).
+    heavy = jnp.asarray(np.random.default_rng(0).standard_cauchy(20_000), jnp.float32)
+    for temperature in (1.0, 2.0):
+        weight = np.asarray(advantage_weights(scaled_advantage(heavy, "rank"), temperature, 1e9))
+        share = weight.sum() ** 2 / np.square(weight).sum() / len(weight)
+        assert share == pytest.approx(np.exp(-1 / temperature**2), rel=0.02)
+    by_spread = np.asarray(advantage_weights(scaled_advantage(heavy, "std"), 1.0, 1e9))
+    assert by_spread.sum() ** 2 / np.square(by_spread).sum() / len(by_spread) < 0.01
 
 
 def test_weights_by_hand():

@@ -1,0 +1,87 @@
+"""The first phase, by default: how far every logged state is from success, on a graph of logged states."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from qdos_brax.config import SkillsConfig, ValuesConfig
+from qdos_brax.data.device import DeviceData
+from qdos_brax.skills.slow_features import slow_features
+from qdos_brax.skills.state_graph import costs_to_go, step_costs
+from qdos_brax.skills.value_phase import segment_advantages
+from qdos_brax.skills.weights import scaled_advantage
+
+
+class GraphPhase:
+    """Shortest paths on the host, in one chunk; nothing is random, so all members share what it finds.
+
+    Args:
+        values: how the graph is made.
+        skills: length of a segment, and scale of its advantage.
+        data: the data set on the device.
+        ends: bool[N], the last row of each episode.
+        members: of the population.
+    """
+
+    name = "values"
+    part = "pretrain"
+    num_chunks = 1
+
+    def __init__(
+        self, values: ValuesConfig, skills: SkillsConfig, data: DeviceData, ends: np.ndarray, members: int
+    ) -> None:
+        self._values, self._skills = values, skills
+        self._data, self._ends, self._members = data, np.asarray(ends, bool), members
+
+    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> jax.Array:
+        """float32[members, N], the value of every logged state, yet to be found."""
+        return jnp.zeros((self._members, self._data.rewards.shape[0]))
+
+    def chunk(self, state: jax.Array) -> tuple[jax.Array, dict[str, np.ndarray]]:
+        """Finds it: minus the cost of the way to success."""
+        costs = graph_costs(self._values, self._skills.horizon, self._data, self._ends)
+        found = {"update": np.ones(self._members), "cost_to_go": np.full(self._members, costs.mean())}
+        return jnp.tile(-jnp.asarray(costs), (self._members, 1)), found
+
+    def finish(self, state: jax.Array, artifacts: dict[str, Any]) -> dict[str, Any]:
+        """Adds the scaled advantage of every segment, float32[members, S].
+
+        Data goes on after a success, and so does this task: to stay there costs nothing, to leave it is a loss. Where
+        an episode ends, the value after its last row is that row's, for the state behind it is no row of the data.
+        """
+        value = state[0]
+        following = jnp.where(self._ends, value, jnp.roll(value, -1))
+        costs = jnp.asarray(step_costs(np.asarray(self._data.rewards)), value.dtype)
+        endless = self._data.replace(rewards=-costs, masks=jnp.ones_like(costs))
+        advantage = segment_advantages(value, following, endless, self._skills.horizon, jnp.ones(()))
+        scaled = scaled_advantage(advantage, self._skills.advantage_scale)
+        return artifacts | {"advantage": jnp.tile(scaled, (self._members, 1))}
+
+
+def graph_costs(values: ValuesConfig, horizon: int, data: DeviceData, ends: np.ndarray) -> np.ndarray:
+    """float32[N], the cost of the way to success from every logged state; all 0, and a line says so, if there is none.
+
+    Args:
+        values: how the graph is made.
+        horizon: steps of a segment.
+        data: the data set.
+        ends: bool[N], the last row of each episode.
+    """
+    observations, next_observations = np.asarray(data.observations), np.asarray(data.next_observations)
+    features = slow_features(observations, next_observations, np.asarray(data.starts), horizon, values.slowness)
+    costs = step_costs(np.asarray(data.rewards))
+    if costs.min() > 0:
+        print("values    no success in the data: all segments will count the same", file=sys.stderr, flush=True)
+    return costs_to_go(
+        features,
+        costs,
+        ends,
+        max_nodes=values.max_nodes,
+        neighbours=values.neighbours,
+        jump_cost=horizon * values.jump_cost,
+    )

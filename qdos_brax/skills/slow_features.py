@@ -1,0 +1,47 @@
+"""Slow features: what of an observation changes little while a segment lasts.
+
+Time-lagged independent component analysis (Molgedey and Schuster 1994; for kinetic models Perez-Hernandez et al. 2013):
+the linear combinations of the observation with the largest autocorrelation at a lag. Where a body is changes slowly,
+how its legs stand does not. Each feature is scaled to a root mean square change of 1 over the lag, which is the commute
+map of Noe et al. (2016) up to a factor: distances then count in lags, the time that the data needs for such a change.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+
+_SMALLEST_VARIANCE = 1e-6  # of a principal direction, relative to the largest: below it lie copies of other columns
+_SMALLEST_CHANGE = 1e-4  # 1 - autocorrelation: what never changes within an episode must not become infinitely far
+
+
+def slow_features(
+    observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, lag: int, slowness: float
+) -> np.ndarray:
+    """The features whose autocorrelation over ``lag`` steps is at least ``slowness``; the slowest one in any case.
+
+    Args:
+        observations: float[N, obs], normalised per column.
+        next_observations: float[N, obs].
+        starts: int[S], S >= 1, first rows of the windows of ``lag`` rows inside one episode.
+        lag: steps.
+        slowness: 0 to 1.
+
+    Returns:
+        float32[N, F], slowest first, each with mean square change 1 over ``lag`` steps.
+    """
+    observations = np.asarray(observations, np.float64)
+    before, after = observations[starts], np.asarray(next_observations, np.float64)[starts + lag - 1]
+    mean = (before.mean(axis=0) + after.mean(axis=0)) / 2
+    before, after = before - mean, after - mean
+    covariance = (before.T @ before + after.T @ after) / (2 * len(starts))
+    lagged = (before.T @ after + after.T @ before) / (2 * len(starts))
+
+    variance, axes = scipy.linalg.eigh(covariance)
+    kept = variance > _SMALLEST_VARIANCE * variance[-1]
+    whiten = axes[:, kept] / np.sqrt(variance[kept])
+    autocorrelation, rotation = scipy.linalg.eigh(whiten.T @ lagged @ whiten)
+    slow = autocorrelation >= min(slowness, autocorrelation[-1])
+    change = 2 * np.maximum(1 - autocorrelation[slow], _SMALLEST_CHANGE)  # mean square, of a feature of variance 1
+    directions = whiten @ rotation[:, slow] / np.sqrt(change)
+    return np.ascontiguousarray(((observations - mean) @ directions)[:, ::-1], np.float32)
