@@ -93,6 +93,7 @@ def test_a_training_that_was_stopped_goes_on_exactly(tmp_path: Path) -> None:
     assert not np.array_equal(fresh[1], other[1])  # weights of the first layer; its biases begin at zero
 
 
+@pytest.mark.slow
 def test_a_learner_goes_on_with_an_empty_replay(tmp_path: Path) -> None:
     run = training(tmp_path / "first")
     run.run(600)
