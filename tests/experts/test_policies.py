@@ -95,7 +95,6 @@ def test_shipped_weights_are_small_and_say_where_they_come_from(name: str) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="the shipped dribbler is trained in part; its header says how far", strict=True)
 def test_the_dribbler_scores() -> None:
     env = envs.make("antsoccer-arena", physics="mujoco")
     assert collect.goals_per_1000(env, policies.ant_dribbler(), noise=0.2, seed=0) >= 5.0
