@@ -169,14 +169,22 @@ class Maze:
         size = self.num_cells
         table = np.tile(np.arange(size, dtype=np.int32)[:, None], (1, size))
         for goal in self.free_cells:
-            steps = self._steps_to(tuple(goal))
             goal_index = goal[0] * self.grid.shape[1] + goal[1]
+            steps = self.steps_table[:, goal_index].reshape(self.grid.shape)
             for i, j in self.free_cells:
                 best = (i, j)
                 for cell in _neighbours(i, j):
                     if 0 <= steps[cell] < steps[best]:
                         best = cell
                 table[i * self.grid.shape[1] + j, goal_index] = best[0] * self.grid.shape[1] + best[1]
+        return table
+
+    @cached_property
+    def steps_table(self) -> np.ndarray:
+        """int32[I*J, I*J]: ``table[start, goal]``, cells to go on a shortest 4-connected path, -1 without."""
+        table = np.full((self.num_cells, self.num_cells), -1, np.int32)
+        for goal in self.free_cells:
+            table[:, goal[0] * self.grid.shape[1] + goal[1]] = self._steps_to(tuple(goal)).reshape(-1)
         return table
 
     def distance(self, a: Any, b: Any) -> np.ndarray:

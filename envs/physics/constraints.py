@@ -75,18 +75,19 @@ class Constraints:
 
     Args:
         model: MuJoCo's model, with pyramidal cones; only its joint limits and contacts count.
+        mjx_model: the same on the device.
         most_contacts: by dimension, how many contacts are kept. MuJoCo C keeps all.
 
     Raises:
         ValueError: contacts of a dimension that ``most_contacts`` does not have.
     """
 
-    def __init__(self, model: mujoco.MjModel, most_contacts: Mapping[int, int]) -> None:
+    def __init__(self, model: mujoco.MjModel, mjx_model: mjx.Model, most_contacts: Mapping[int, int]) -> None:
         self._model = model
-        self._mjx_model = mjx.put_model(model, impl="jax")
+        self._mjx_model = mjx_model
         self._limited = np.flatnonzero(model.jnt_limited)
         self._limits = _limit_table(model, self._limited)
-        self._pairs = _tabulate_pairs(model, self._mjx_model, most_contacts)
+        self._pairs = _tabulate_pairs(model, mjx_model, most_contacts)
         self._root = model.body_rootid[model.dof_bodyid]  # int[nv], whose centre of mass cdof is taken about
 
     def rows(self, data: mjx.Data) -> Rows:

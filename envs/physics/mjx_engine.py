@@ -71,7 +71,7 @@ class MjxEngine:
         self._sensors = sensors
         self._mjx_model = mjx.put_model(model, impl="jax")
         self._data = mjx.make_data(model, impl="jax")
-        self._constraints = Constraints(model, most_contacts)
+        self._constraints = Constraints(model, self._mjx_model, most_contacts)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
         """The state at (qpos[nq], qvel[nv]) without warm start."""

@@ -19,8 +19,9 @@ import numpy as np
 from flax import traverse_util
 
 from qdos_brax.errors import UserError
-from qdos_brax.experts.views import ANT_NQ, ANT_NV, ball_view, body_view, turned
+from qdos_brax.experts.views import ANT_NQ, ANT_NV, ball_view, body_view, turned, unit_vector
 from qdos_brax.networks import DiagonalGaussian
+from qdos_brax.runs.folder import replacing
 
 RESIDUAL = 1.0
 """How much of a joint's range the dribbler can add to the walker's action."""
@@ -107,7 +108,7 @@ def dribbler_joints(
         command: [..., 10]; the first two are added to the heading of ``push_heading``.
     """
     offset = ball_view(qpos, qvel, direction)[..., :2]
-    heading = _unit(push_heading(offset) + _OVERRIDE * command[..., :2])
+    heading = unit_vector(push_heading(offset) + _OVERRIDE * command[..., :2])
     back = direction * jnp.array([1.0, -1.0])  # seen along this, what was turned is as it was in the world
     return jnp.clip(walker.act(qpos, qvel, turned(heading, back)) + RESIDUAL * command[..., 2:], -1.0, 1.0)
 
@@ -115,17 +116,13 @@ def dribbler_joints(
 def push_heading(offset: jax.Array) -> jax.Array:
     """Unit vector[..., 2] round a ball at ``offset[..., 2]`` to behind it, then through it along +x."""
     ahead, beside = offset[..., :1], offset[..., 1:]
-    push = _unit(jnp.concatenate([jnp.ones_like(ahead), _STEER * beside], axis=-1))
-    outward = -_unit(offset)
+    push = unit_vector(jnp.concatenate([jnp.ones_like(ahead), _STEER * beside], axis=-1))
+    outward = -unit_vector(offset)
     side = jnp.where(beside <= 0, 1.0, -1.0)
     round_it = side * jnp.concatenate([-outward[..., 1:], outward[..., :1]], axis=-1)
     gap = jnp.linalg.norm(offset, axis=-1, keepdims=True)
-    around = _unit(round_it + _PULL * (_CIRCLE - gap) * outward)
+    around = unit_vector(round_it + _PULL * (_CIRCLE - gap) * outward)
     return jnp.where((ahead > 0) & (jnp.abs(beside) < _LANE + _FUNNEL * ahead), push, around)
-
-
-def _unit(vector: jax.Array) -> jax.Array:
-    return vector / jnp.maximum(jnp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6)
 
 
 class Dribbler:
@@ -178,10 +175,8 @@ def write_actor(path: Path, actor: Actor) -> None:
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Writes an .npz, whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
-    temporary.replace(path)
+    with replacing(path) as partial:
+        np.savez_compressed(partial, allow_pickle=False, **arrays)
 
 
 def read_actor(path: Path) -> Actor:

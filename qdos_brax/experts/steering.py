@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.maze import UNIT, Maze
+from qdos_brax.experts.views import unit_vector
 
 _CORRIDOR = 1.2  # m to either side of a straight line that must be free: the reach of the ant's legs
 
@@ -26,7 +27,7 @@ class Navigator:
         self.maze = maze
         self.next_cell = jnp.asarray(maze.next_step_table)  # int32[C, C], the neighbour to enter, from row to column
         self.sight_cell = jnp.asarray(_farthest_in_sight(maze))  # int32[C, C], the last cell a straight walk reaches
-        self._cell_steps = jnp.asarray(_cell_steps(maze))  # int32[C, C], length of the path, -1 without one
+        self._cell_steps = jnp.asarray(maze.steps_table)  # int32[C, C], cells to go, -1 without a path
         indices = maze.cell_index(maze.ij_to_xy(maze.free_cells))
         leads_on = (maze.next_step_table[indices] != indices[:, None]).any(axis=1)  # not walled in on all sides
         self.free_xy = jnp.asarray(maze.ij_to_xy(maze.free_cells[leads_on]), jnp.float32)  # float32[F, 2]
@@ -70,23 +71,6 @@ def approach(maze: Navigator, xy: jax.Array, target_xy: jax.Array) -> tuple[jax.
     meeting = maze.sight_cell[here, there]
     in_sight = (here == there) | (meeting == there)
     return unit_vector(jnp.where(in_sight, target_xy, maze.centre(meeting)) - xy), in_sight
-
-
-def unit_vector(vector: jax.Array) -> jax.Array:
-    """``vector[2]`` at length one; zero stays zero."""
-    return vector / jnp.maximum(jnp.linalg.norm(vector), 1e-6)
-
-
-def _cell_steps(maze: Maze) -> np.ndarray:
-    """int32[C, C]: cells to go on the shortest path from row to column, -1 where there is none."""
-    cells = np.arange(maze.num_cells)
-    at = np.repeat(cells[:, None], maze.num_cells, axis=1)
-    steps = np.zeros_like(at)
-    for _ in cells:
-        moves = maze.next_step_table[at, cells]
-        steps += moves != at
-        at = moves
-    return np.where(at == cells, steps, -1).astype(np.int32)
 
 
 def _farthest_in_sight(maze: Maze) -> np.ndarray:

@@ -20,6 +20,11 @@ def turned(vector: jax.Array, direction: jax.Array) -> jax.Array:
     return jnp.concatenate([cos * x + sin * y, cos * y - sin * x, vector[..., 2:]], axis=-1)
 
 
+def unit_vector(vector: jax.Array) -> jax.Array:
+    """``vector[..., 2]`` at length one; zero stays zero."""
+    return vector / jnp.maximum(jnp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6)
+
+
 def body_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
     """Proprioception of a body with a free root and k joints.
 

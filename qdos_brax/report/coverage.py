@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import user_errors
+from qdos_brax.runs.folder import replacing
 
 _BINS_PER_CELL = 8
 
@@ -54,11 +53,8 @@ def draw_coverage(qpos: np.ndarray, env: Any, out: Path, title: str) -> None:
         axis.legend(loc="upper right", fontsize="small")
         figure.colorbar(image, ax=axis, label="rows", shrink=0.8)
     figure.suptitle(title)
-    partial = out.with_name(f".{out.stem}.{os.getpid()}.png")
-    with user_errors(out):
-        try:
+    try:
+        with replacing(out) as partial:
             figure.savefig(partial, dpi=110)
-            os.replace(partial, out)
-        finally:
-            partial.unlink(missing_ok=True)
-            plt.close(figure)
+    finally:
+        plt.close(figure)

@@ -109,13 +109,23 @@ def new_path(root: str | Path, name: str) -> Path:
 
 def write_text(path: Path, text: str) -> None:
     """Replaces ``path`` by ``text`` at once: a reader, or a run that goes on after a kill, sees the old or the new."""
+    with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file of the same ending to write to, which takes ``path``'s place at the end; nothing changes on an error."""
+    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     with user_errors(path):
-        partial = path.with_name(f".{path.name}.partial")
-        with partial.open("w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
+        try:
+            yield partial
+            os.replace(partial, path)
+        finally:
+            with contextlib.suppress(OSError):  # of a folder that cannot be written, which is reported already
+                partial.unlink()
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ def test_rows_equal_those_of_c(body: Body) -> None:
     model = body.near(True)
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     mjx_model, start = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
-    constraints = Constraints(model, body.most_contacts)
+    constraints = Constraints(model, mjx_model, body.most_contacts)
 
     @jax.jit
     def ours(qpos: jax.Array, qvel: jax.Array, walls: jax.Array) -> tuple[jax.Array, ...]:
