@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.data.segments import macro_return, segment_starts, window
+from qdos_brax.data.segments import episode_last, macro_return, segment_starts, window
 
 
 class Normaliser(struct.PyTreeNode):
@@ -37,6 +37,7 @@ class DeviceData(struct.PyTreeNode):
         rewards: float32[N].
         masks: float32[N].
         starts: int32[S], first rows of all windows of H steps inside one episode.
+        last: int32[N], the last row of each row's episode.
         qpos: float32[N, nq], or None when the file holds no simulator states.
         qvel: float32[N, nv], or None.
     """
@@ -47,6 +48,7 @@ class DeviceData(struct.PyTreeNode):
     rewards: jax.Array
     masks: jax.Array
     starts: jax.Array
+    last: jax.Array
     qpos: jax.Array | None
     qvel: jax.Array | None
 
@@ -72,6 +74,7 @@ def to_device(dataset: Dataset, horizon: int) -> tuple[DeviceData, Normaliser]:
         rewards=jnp.asarray(dataset.rewards),
         masks=jnp.asarray(dataset.masks),
         starts=jnp.asarray(segment_starts(dataset.ends, horizon)),
+        last=jnp.asarray(episode_last(dataset.ends)),
         qpos=None if dataset.qpos is None else jnp.asarray(dataset.qpos),
         qvel=None if dataset.qvel is None else jnp.asarray(dataset.qvel),
     )
