@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,14 @@ import numpy as np
 import pytest
 
 from qdos_brax import config as configs
+from qdos_brax.cli import train_main
 from qdos_brax.errors import UserError
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.sac import SAC
 from qdos_brax.latent_map import Prior, latent_map
 from qdos_brax.methods import METHODS
 from qdos_brax.methods import settings as recipe_settings
-from qdos_brax.methods.build import build_phases
+from qdos_brax.methods.build import build_phases, evaluate_run
 from qdos_brax.networks import gaussian_log_prob
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
@@ -46,7 +48,7 @@ PHASES = {
 def config_of(method: str, **values: Any) -> configs.Config:
     """The plane's configuration for a method."""
     horizon = recipe_settings(method, "antmaze").get("skills.horizon", 5)
-    return point_config(**{"method": method, "skills.horizon": horizon, "values.n_step": horizon}, **values)
+    return point_config(**{"method": method, "skills.horizon": horizon, "values.n_step": horizon} | values)
 
 
 def test_every_method_of_the_issue_is_there() -> None:
@@ -295,3 +297,18 @@ def test_the_priors_density_over_actions_has_mass_one(name: str) -> None:
     density = jnp.exp(gaussian_log_prob(mapping.to_latent(u, prior), *prior) + mapping.log_jacobian(u, prior))
     inside = {"arctanh": 1.0, "box": 1.0, "prior": 0.9545}[name]  # two standard deviations
     np.testing.assert_allclose(jnp.trapezoid(density, u[:, 0]), inside, atol=1e-3)
+
+
+# --- The real program ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_runs_by_name_and_is_evaluated(method: str, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert train_main(["--env", "antmaze-medium", "--preset", "smoke", "--method", method, "--out", str(out)]) == 0
+    (member,) = json.loads((out / "summary.json").read_text())["members"]
+    assert member["status"] == "ok" and member["eval_episodes"] == 2
+    (played,) = evaluate_run(out, 1)
+    assert played["return"] >= -1000
