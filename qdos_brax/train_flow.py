@@ -20,7 +20,6 @@ from qdos_brax import config as configs
 from qdos_brax.config import Config
 from qdos_brax.data import cache, download, formats
 from qdos_brax.errors import UserError
-from qdos_brax.methods import METHODS
 from qdos_brax.methods.build import build_phases
 from qdos_brax.report.curves import draw_curves
 from qdos_brax.runs import compile_cache
@@ -54,7 +53,6 @@ def start(make_config: Callable[[], Config], preset_given: bool, started: float)
     """
     prepare_jax()
     asked = make_config()
-    _check_method(asked.method)
     if asked.dataset:
         download.check(asked.dataset)
     env = _make_env(asked)
@@ -86,7 +84,6 @@ def resume(path: str, started: float) -> dict[str, Any]:
             _conclude(folder, summary)
             return summary
         config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
-        _check_method(config.method)
         env = _make_env(config)
         _announce(config, config, chosen=False)
         return _run(config, env, folder, started)
@@ -112,13 +109,6 @@ def _run(config: Config, env: Any, folder: RunFolder, started: float) -> dict[st
     draw_curves([folder.path], folder.curves)
     _conclude(folder, summary)
     return summary
-
-
-def _check_method(name: str) -> None:
-    if name not in METHODS:
-        raise UserError(
-            f"there is no method {name!r}{configs.nearest(name, list(METHODS))}; there are {', '.join(METHODS)}"
-        )
 
 
 def _make_env(config: Config) -> Any:

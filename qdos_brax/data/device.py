@@ -26,6 +26,11 @@ class Normaliser(struct.PyTreeNode):
         """Normalises [..., obs]."""
         return (observation - self.mean) / self.scale
 
+    def repeated(self, members: int) -> dict[str, jax.Array]:
+        """Its fields, with a leading axis of ``members`` copies."""
+        fields = {"mean": self.mean, "scale": self.scale}
+        return {name: jnp.broadcast_to(x, (members, *x.shape)) for name, x in fields.items()}
+
 
 class DeviceData(struct.PyTreeNode):
     """N transitions as device arrays; observations are normalised, rewards and masks are the task's.
