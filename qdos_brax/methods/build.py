@@ -62,9 +62,9 @@ def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
     task = _task(config, env, dataset)
     high = config.high_level
     source = make_source(config, env)
-    labelled = round(high.batch_size * high.offline_fraction) > 0
     if task.recipe.policy is not None:
         return [_policy_phase(task, task.recipe.policy)]
+    labelled = round(high.batch_size * high.offline_fraction) > 0
     guide = None if task.recipe.guide is None else _GUIDES[task.recipe.guide](config, env)
     return [
         *_SOURCES[task.recipe.source].phases(task),
