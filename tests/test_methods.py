@@ -213,14 +213,17 @@ def crash_at_the_second(chunk: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return crashing
 
 
-@pytest.mark.parametrize("method", ["explore", "diffusion-jsrl", "iql"])
+@pytest.mark.parametrize(
+    "method", ["diffusion-jsrl", *(pytest.param(name, marks=pytest.mark.slow) for name in ("explore", "iql"))]
+)
 def test_a_crashed_run_ends_as_if_nothing_had_happened(method: str, tmp_path: Path) -> None:
     config = config_of(method, **{"labels.start_env_steps": 40, "policy.every_updates": 20, "guide.updates": 20})
 
+    phases = build_phases(config, PointEnv(), point_dataset(20))  # once: what they carry over is what ``init`` sets
+    whole_chunk = phases[-1].chunk
+
     def run(path: Path, crash: bool) -> list[dict[str, str]]:
-        phases = build_phases(config, PointEnv(), point_dataset(20))
-        if crash:
-            phases[-1].chunk = crash_at_the_second(phases[-1].chunk)
+        phases[-1].chunk = crash_at_the_second(whole_chunk) if crash else whole_chunk
         folder = RunFolder.open(str(path)) if path.exists() else RunFolder.create(str(path))
         folder.config.write_text(configs.to_yaml(config))
         with folder.held():
