@@ -59,6 +59,7 @@ def near(actions, centres):
     return (np.linalg.norm(actions[:, None] - centres[None], axis=-1) < 0.3).mean(axis=0)
 
 
+@pytest.mark.slow
 def test_it_finds_both_solutions_and_no_failure():
     """Any state; half of the logged actions solve the task, one way or the other, half fail and cost 5.
 

@@ -52,6 +52,7 @@ def looks(learner, params, observations):
     return np.log(np.clip(1 - (1 - DISCOUNT) * np.asarray(norm), 1e-3, None)) / np.log(DISCOUNT), np.asarray(action)
 
 
+@pytest.mark.slow
 def test_norms_are_shortest_paths_and_skills_follow_them():
     # A corridor in the shape of a U: its ends are 2 apart through the wall, 10 on foot.
     cells = [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (1, 4), (2, 4), (2, 3), (2, 2), (2, 1), (2, 0)]
@@ -84,8 +85,8 @@ def test_norms_rank_the_ways_around_walls_of_a_grid():
     grid = Gridworld([".....", ".###.", "...#.", ".#.#.", ".#..G"])
     observations = grid.cells - grid.cells.mean(axis=0)
     data = walks(grid.after, observations, MOVES.astype(float), episodes=300, length=40)
-    learner = Hilbert(2, 2, latent_dim=8, hidden=(64, 64), batch_size=256)
-    state, _ = train(learner, data, HYPER, 10_000)
+    learner = Hilbert(2, 2, latent_dim=8, hidden=(64, 64), batch_size=128)
+    state, _ = train(learner, data, HYPER, 5000)
     distance, action = looks(learner, learner.params(state), jnp.asarray(observations))
     steps, apart = grid.distances(), ~np.eye(grid.size, dtype=bool)
     ranks = lambda x: np.argsort(np.argsort(x))  # noqa: E731
