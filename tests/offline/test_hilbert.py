@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qdos_brax.offline.hilbert import GoalBatch, Hilbert, HilbertHyper, goal_rows, random_directions
+from qdos_brax.offline.hilbert import GoalBatch, Hilbert, HilbertHyper, goal_rows
 from tests.offline.gridworld import MOVES, Gridworld, device_data
 from tests.offline.training import train
 
@@ -52,6 +52,7 @@ def looks(learner, params, observations):
     return np.log(np.clip(1 - (1 - DISCOUNT) * np.asarray(norm), 1e-3, None)) / np.log(DISCOUNT), np.asarray(action)
 
 
+@pytest.mark.slow
 def test_norms_are_shortest_paths_and_skills_follow_them():
     # A corridor in the shape of a U: its ends are 2 apart through the wall, 10 on foot.
     cells = [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (1, 4), (2, 4), (2, 3), (2, 2), (2, 1), (2, 0)]
@@ -84,8 +85,8 @@ def test_norms_rank_the_ways_around_walls_of_a_grid():
     grid = Gridworld([".....", ".###.", "...#.", ".#.#.", ".#..G"])
     observations = grid.cells - grid.cells.mean(axis=0)
     data = walks(grid.after, observations, MOVES.astype(float), episodes=300, length=40)
-    learner = Hilbert(2, 2, latent_dim=8, hidden=(64, 64), batch_size=256)
-    state, _ = train(learner, data, HYPER, 10_000)
+    learner = Hilbert(2, 2, latent_dim=8, hidden=(64, 64), batch_size=128)
+    state, _ = train(learner, data, HYPER, 5000)
     distance, action = looks(learner, learner.params(state), jnp.asarray(observations))
     steps, apart = grid.distances(), ~np.eye(grid.size, dtype=bool)
     ranks = lambda x: np.argsort(np.argsort(x))  # noqa: E731
@@ -98,32 +99,40 @@ def test_norms_rank_the_ways_around_walls_of_a_grid():
 
 def test_goals_lie_ahead_in_the_episode_or_anywhere():
     data = device_data(np.zeros((60, 1)), np.zeros((60, 1)), last=np.repeat(np.arange(20, 61, 20) - 1, 20))
-    rows = jnp.full(4000, 25)
-    ahead = np.asarray(goal_rows(data, rows, jax.random.key(0), 0.5, 0.0))
+
+    @jax.jit
+    def draw(rows, key, random_share):
+        return goal_rows(data, rows, key, 0.5, random_share)
+
+    ahead = np.asarray(draw(jnp.full(4000, 25), jax.random.key(0), 0.0))
     assert ahead.min() == 26 and ahead.max() <= 39
     # Geometric with p = 1/2: k steps ahead with probability 2^-k.
     np.testing.assert_allclose([(ahead == 25 + k).mean() for k in (1, 2, 3)], [0.5, 0.25, 0.125], atol=0.03)
-    assert (np.asarray(goal_rows(data, jnp.full(50, 39), jax.random.key(1), 0.5, 0.0)) == 39).all()
-    anywhere = np.asarray(goal_rows(data, rows, jax.random.key(2), 0.5, 1.0))
+    assert (np.asarray(draw(jnp.full(4000, 39), jax.random.key(1), 0.0)) == 39).all()
+    anywhere = np.asarray(draw(jnp.full(4000, 25), jax.random.key(2), 1.0))
     np.testing.assert_allclose(np.histogram(anywhere, [0, 20, 40, 60])[0] / 4000, 1 / 3, atol=0.04)
 
 
 def test_the_losses_by_hand():
-    """phi(s) = (s, 0) in one dimension: a network is replaced by the identity, so every number can be worked out."""
+    """phi is the identity of the line: a network without hidden layers, so that every number can be worked out."""
     learner = Hilbert(1, 1, latent_dim=1, hidden=(), batch_size=1)
     identity = {"params": {"Dense_0": {"kernel": jnp.ones((2, 1, 1)), "bias": jnp.zeros((2, 1))}}}
     hyper = HilbertHyper(1e-3, 0.9, 0.9, 0.5, 0.005, 10.0)
-    batch = GoalBatch(*(jnp.array([[x]]) for x in (0.0, 1.0, 1.0, 4.0)), reached=jnp.zeros(1))
-    # Target -1 - 0.5 * 3 = -2.5 against V = -4: advantage 1.5 > 0, error 1.5 for both heads.
-    assert float(learner.distance_loss(identity, identity, batch, hyper)) == pytest.approx(2 * 0.9 * 1.5**2)
-    away = batch._replace(next_observation=jnp.array([[-4.0]]))
-    # Target -1 - 0.5 * 8 = -5 against -4: advantage -1, weight 0.1.
-    assert float(learner.distance_loss(identity, identity, away, hyper)) == pytest.approx(2 * 0.1 * 1)
-    # Reached: target 0, V = -4.
-    there = batch._replace(reached=jnp.ones(1))
-    assert float(learner.distance_loss(identity, identity, there, hyper)) == pytest.approx(2 * 0.9 * 16)
-    seen = learner.skill_batch(identity, away, jnp.array([[-1.0]]), 0.5)
-    assert float(seen.reward[0]) == 4.0 and float(seen.discount[0]) == 0.5
+
+    @jax.jit
+    def look(after, reached):
+        batch = GoalBatch(jnp.zeros((1, 1)), jnp.ones((1, 1)), jnp.full((1, 1), after), jnp.full((1, 1), 4.0), reached)
+        seen = learner.skill_batch(identity, batch, jnp.array([[-1.0]]), 0.5)
+        direction = learner.direction({"phi": identity}, jnp.array([3.0]), jnp.array([after]))
+        return learner.distance_loss(identity, identity, batch, hyper), seen, direction
+
+    # From 0 to 1 on the way to 4: target -1 - 0.5 * 3 = -2.5 against V = -4, advantage 1.5, error 1.5 of both heads.
+    loss, seen, direction = look(1.0, jnp.zeros(1))
+    assert float(loss) == pytest.approx(2 * 0.9 * 1.5**2)
+    assert float(seen.reward[0]) == -1 and float(seen.discount[0]) == 0.5 and float(direction[0]) == -1
     np.testing.assert_array_equal(seen.observation, [[0.0, -1.0]])
-    np.testing.assert_array_equal(learner.direction({"phi": identity}, jnp.array([3.0]), jnp.array([1.0])), [-1.0])
-    np.testing.assert_allclose(jnp.linalg.norm(random_directions(jax.random.key(0), 5, 3), axis=-1), 1, rtol=1e-5)
+    np.testing.assert_array_equal(seen.next_observation, [[1.0, -1.0]])
+    # From 0 to -4: target -1 - 0.5 * 8 = -5, advantage -1, so that the weight is 0.1.
+    assert float(look(-4.0, jnp.zeros(1))[0]) == pytest.approx(2 * 0.1 * 1)
+    # There already: target 0.
+    assert float(look(1.0, jnp.ones(1))[0]) == pytest.approx(2 * 0.9 * 16)
