@@ -281,7 +281,8 @@ class DiveOffConfig:
         discount: per environment step.
         target_rate: Polyak rate of the targets.
         scale: of the advantage in the weights exp(scale A).
-        kl_weight: of the posterior's divergence, against a mean squared error of reconstruction.
+        kl_weight: of the posterior's divergence, against a mean squared error of reconstruction (the authors' code has
+            50, with which the posterior collapses here, see ``qdos_brax.offline.diveoff``).
         information: weight of the information term.
         autoencoder_updates: first gradient steps, without weights and without that term.
         updates: gradient steps.
@@ -294,7 +295,7 @@ class DiveOffConfig:
     discount: Scannable = number(0.99, high=1.0)
     target_rate: Scannable = number(0.005, high=1.0, above=True)
     scale: Scannable = number(3.0)
-    kl_weight: Scannable = number(50.0)
+    kl_weight: Scannable = number(0.1)
     information: Scannable = number(2.0)
     autoencoder_updates: int = count(10_000, low=0)
     updates: int = count(1_000_000)
