@@ -3,6 +3,8 @@
 Denoising diffusion (Ho et al. 2020) with predicted noise; the schedule, the residual network with learned Fourier
 features of time and the averaged parameters are those of IDQL (Hansen-Estruch et al. 2023), which SUPE's guide policy
 (Wilcoxson et al. 2024) is made of: 5 steps, variance-preserving schedule, 3 blocks, dropout 0.1, average rate 0.001.
+So few steps blur: the last one starts from noise of deviation 0.44. Of two modes 1.2 apart (tests/offline/
+test_diffusion.py) 5 steps put 0.69 of the actions within 0.2 of a mode, 10 steps 0.92.
 """
 
 from __future__ import annotations
