@@ -24,7 +24,6 @@ class RunFolder:
         metrics: metrics.csv, one row per member and log point.
         provenance: run.json: the command, the data file's hash, the versions of the packages.
         summary: summary.json, present once the run has ended.
-        curves: curves.png.
         checkpoints: folder of the checkpoints.
     """
 
@@ -34,7 +33,6 @@ class RunFolder:
         self.provenance = self.path / "run.json"
         self.metrics = self.path / "metrics.csv"
         self.summary = self.path / "summary.json"
-        self.curves = self.path / "curves.png"
         self.checkpoints = self.path / "checkpoints"
 
     @classmethod
