@@ -250,7 +250,7 @@ def _provenance(study: Study) -> Section:
             lines += [f"{package} {version}" for package, version in packages.items()]
             listings.append((f"{name}: made from", "\n".join(lines)))
     header = ["run", "folder", "preset", "physics", "data (SHA-256)", "jax"]
-    return Section("Configuration and provenance", tables=[Table("", header, rows)], listings=listings)
+    return Section("Configuration and provenance", tables=[Table("", header, rows, words=6)], listings=listings)
 
 
 def _run_name(study: Study, index: int) -> str:

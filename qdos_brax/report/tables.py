@@ -25,19 +25,21 @@ class Table:
         header: names of the columns; the first one is that of the rows' names.
         rows: the cells.
         note: how to read it.
+        words: how many of the first columns hold words, not numbers.
     """
 
     title: str
     header: list[str]
     rows: list[list[str]]
     note: str = ""
+    words: int = 1
 
     def text(self) -> str:
         """For a terminal."""
         widths = [max(map(len, column)) for column in zip(self.header, *self.rows, strict=True)]
         lines = [
             "  ".join(
-                cell.rjust(width) if i else cell.ljust(width)
+                cell.ljust(width) if i < self.words else cell.rjust(width)
                 for i, (cell, width) in enumerate(zip(row, widths, strict=True))
             )
             for row in (self.header, *self.rows)
@@ -46,7 +48,7 @@ class Table:
 
     def markdown(self) -> str:
         """For a README."""
-        rule = ["---", *["---:"] * (len(self.header) - 1)]
+        rule = ["---"] * self.words + ["---:"] * (len(self.header) - self.words)
         cells = [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in (self.header, rule, *self.rows)]
         return "\n\n".join(part for part in (f"**{self.title}**", "\n".join(cells), self.note) if part)
 
@@ -112,7 +114,7 @@ def _statistics_table(study: Study) -> Table:
     if several:
         header.append(f"P(better than {study.reference.label}) [95 %]")
     note = "interquartile mean (of fewer than four scores: the mean); bootstrap over seeds within each task"
-    return Table("Table 1, continued. What this many seeds can say", header, rows, note)
+    return Table("Table 1, continued. What this many seeds can say", header, rows, note, words=2)
 
 
 def _first_goal_table(study: Study) -> Table:

@@ -65,7 +65,8 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) 
 
 def _text(study: Study) -> str:
     parts = [table.text() for table in tables(study)]
-    return "\n\n".join([*parts, *(f"note: {note}" for note in study.notes)])
+    notes = "\n".join(f"note: {note}" for note in study.notes)
+    return "\n\n".join([*parts, *([notes] if notes else [])])
 
 
 def _markdown(study: Study) -> str:
