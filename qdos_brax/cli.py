@@ -131,8 +131,6 @@ def configs_from_args(args: argparse.Namespace) -> list[Config]:
     if args.method is None:
         return [load_config(args.env, args.preset, flags, args.set)]
     methods = [name.strip() for name in args.method.split(",")]
-    if len(methods) > 1 and any(text.partition("=")[0].strip() == "method" for text in args.set):
-        raise UserError("--method names several methods and --set method=.. one; leave one of the two out")
     for name in methods:
         if methods.count(name) > 1:
             raise UserError(f"--method holds {name!r} twice: {args.method}")

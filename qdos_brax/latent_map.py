@@ -28,17 +28,25 @@ class LatentMap(Protocol):
         """u[..., d] of z[..., d], clipped into the box."""
         ...
 
+    def log_jacobian(self, action: jax.Array, prior: Prior) -> jax.Array:
+        """log |dz / du| [...], summed over the d dimensions."""
+        ...
+
 
 class ArctanhMap:
     """z = arctanh(u): every latent can be played (SUPE)."""
 
     def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
         """z = arctanh(u)."""
-        return jnp.arctanh(jnp.clip(action, -1 + MARGIN, 1 - MARGIN))
+        return jnp.arctanh(_inside(action))
 
     def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
         """u = tanh(z)."""
         return _inside(jnp.tanh(latent))
+
+    def log_jacobian(self, action: jax.Array, prior: Prior) -> jax.Array:
+        """-sum log(1 - u^2)."""
+        return -jnp.sum(jnp.log1p(-(_inside(action) ** 2)), axis=-1)
 
 
 class BoxMap:
@@ -58,6 +66,10 @@ class BoxMap:
     def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
         """u = z / c."""
         return _inside(latent / self._half_side)
+
+    def log_jacobian(self, action: jax.Array, prior: Prior) -> jax.Array:
+        """d log c."""
+        return jnp.sum(jnp.broadcast_to(jnp.log(self._half_side), action.shape), axis=-1)
 
 
 class PriorMap:
@@ -81,6 +93,10 @@ class PriorMap:
     def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
         """u = (z - mean) / (c std)."""
         return _inside((latent - prior.mean) * jnp.exp(-prior.log_std) / self._half_side)
+
+    def log_jacobian(self, action: jax.Array, prior: Prior) -> jax.Array:
+        """d log c + sum log std."""
+        return jnp.sum(jnp.log(self._half_side) + prior.log_std, axis=-1)
 
 
 def latent_map(name: str, half_side: jax.Array | float) -> LatentMap:

@@ -52,8 +52,6 @@ def start(make_configs: Callable[[], Sequence[Config]], preset_given: bool, star
     """
     prepare_jax()
     asked = make_configs()
-    for config in asked:
-        _check_method(config.method)
     first = asked[0]
     if first.dataset:
         download.check(first.dataset)
@@ -115,7 +113,6 @@ def _go_on(folder: RunFolder, started: float) -> None:
             _conclude(folder, summary)
             return
         config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
-        _check_method(config.method)
         env = _make_env(config)
         _announce(config, config, chosen=False)
         _run(config, env, folder, started)
@@ -150,13 +147,6 @@ def _run(config: Config, env: Any, folder: RunFolder, started: float) -> None:
         started=started,
     )
     _conclude(folder, summary)
-
-
-def _check_method(name: str) -> None:
-    if name not in METHODS:
-        raise UserError(
-            f"there is no method {name!r}{configs.nearest(name, list(METHODS))}; there are {', '.join(METHODS)}"
-        )
 
 
 def _make_env(config: Config) -> Any:

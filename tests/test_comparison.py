@@ -93,8 +93,8 @@ def test_alpha_is_not_scanned_where_it_weighs_nothing(tmp_path: Path, built: lis
     [
         ("--method qdos,qdso", "there is no method 'qdso', did you mean 'qdos'?"),
         ("--method qdos,qdos", "--method holds 'qdos' twice"),
-        ("--method qdos,", "method must be a word"),
-        ("--method qdos,supe --set method=supe", "leave one of the two out"),
+        ("--method qdos,", "there is no method ''"),
+        ("--method qdos,supe --set method=supe", "--set method comes too late"),
         ("--method qdos,supe --out {tmp}/full", "is not empty"),
         ("--method qdos,supe --out {tmp}/file", "cannot write"),
     ],

@@ -14,6 +14,8 @@ import yaml
 from qdos_brax.config.rules import convert, nearest
 from qdos_brax.config.schema import Config, leaves, plain
 from qdos_brax.errors import UserError
+from qdos_brax.methods import METHODS
+from qdos_brax.methods import settings as method_settings
 
 # The folder beside the packages: the repository's root in an editable install, site-packages in a built wheel.
 CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"
@@ -39,12 +41,15 @@ def load_config(
     family = env.split("-")[0]
     if family not in families():
         raise UserError(f"unknown task {env!r}{nearest(family, families())}; the families are {', '.join(families())}")
+    flags = _checked_keys(flags or {}, "a flag")
+    method = _known_method(flags.get("method", Config.method))
     preset = preset or default_preset()
     values: dict[str, Any] = {}
     values |= _read_layer(CONFIG_DIR / f"{family}.yaml")
+    values |= _checked_keys(method_settings(method, family), f"the recipe of {method}")
     values |= _read_preset(preset, family)
     values |= {"env": env, "preset": preset}
-    values |= _checked_keys(flags or {}, "a flag")
+    values |= flags
     values |= dict(_parse_set(text) for text in sets)
     return _build(values)
 
@@ -94,6 +99,14 @@ def _read_layer(path: Path) -> dict[str, Any]:
     return _checked_keys(_flat(_read_mapping(path)), str(path))
 
 
+def _known_method(name: str) -> str:
+    if name not in METHODS:
+        raise UserError(
+            f"there is no method {name!r}{nearest(str(name), list(METHODS))}; there are {', '.join(METHODS)}"
+        )
+    return name
+
+
 def _read_preset(name: str, family: str) -> dict[str, Any]:
     if name not in presets():
         raise UserError(f"unknown preset {name!r}{nearest(name, presets())}; there are {', '.join(presets())}")
@@ -125,7 +138,7 @@ def _parse_set(text: str) -> tuple[str, Any]:
     key = key.strip()
     if not equals or not key:
         raise UserError(f"--set wants key=value, not {text!r}")
-    if key in ("env", "preset"):
+    if key in ("env", "preset", "method"):
         raise UserError(f"--set {key} comes too late, it decides which values are read; use --{key}")
     _checked_keys({key: None}, "--set")
     try:
@@ -176,7 +189,8 @@ def _build(values: Mapping[str, Any]) -> Config:
 
 
 def _check_together(config: Config) -> None:
-    """Ranges that involve two fields."""
+    """What no field's own rule can say."""
+    _known_method(config.method)
     high = config.high_level
     if high.target_subset > high.ensemble:
         raise UserError(

@@ -71,7 +71,7 @@ class SkillsConfig:
     """The advantage-weighted trajectory VAE and the mutual information of its skills.
 
     Attributes:
-        horizon: H, environment steps of a segment and of a macro step.
+        horizon: H, environment steps of a segment and of a macro step; 1 for methods without skills.
         latent_dim: size of the skill z.
         encoder_hidden: width of the bidirectional GRU (the posterior).
         encoder_layers: its layers.
@@ -126,7 +126,8 @@ class LabelsConfig:
     Attributes:
         offline_reward: reward of an offline macro transition: the data's own ("data"), the lowest possible ("min"),
             or the reward model's ("pred").
-        rnd_coefficient: weight of the random-network-distillation bonus.
+        rnd_coefficient: weight of the random-network-distillation bonus; 0 leaves it out.
+        bonus_rows: which rows earn the bonus, "all" or "online".
         rnd_hidden: widths of the hidden layers of its two networks.
         rnd_features: size of their output.
         rnd_learning_rate: Adam's.
@@ -137,6 +138,7 @@ class LabelsConfig:
 
     offline_reward: str = choice("data", "data", "min", "pred")
     rnd_coefficient: Scannable = number(8.0)
+    bonus_rows: str = choice("all", "all", "online")
     rnd_hidden: tuple[int, ...] = widths(256, 256, 256)
     rnd_features: int = count(256)
     rnd_learning_rate: Scannable = rate(3e-4)
@@ -160,13 +162,16 @@ class HighLevelConfig:
         discount: per macro step.
         target_rate: Polyak rate of the target critics.
         init_temperature: first value of the entropy temperature.
-        target_entropy_scale: the target entropy is minus this times the latent dimension.
+        regulariser: what the temperature weighs: the actor's entropy ("entropy", SAC), or its divergence from the
+            skill prior ("prior", in the bootstrap value too; SPiRL, Pertsch et al. 2020).
+        target_entropy_scale: ("entropy") the target entropy is minus this times the width of the action.
+        target_divergence: ("prior") KL(actor || skill prior) that the temperature aims at, in nats.
         latent_map: from the action u in (-1, 1) to the skill z: "arctanh", "box" (z = latent_box * u), or "prior"
             (z = mean + latent_box * standard deviation * u of the state prior).
         num_envs: environments stepped side by side.
         warmup_env_steps: first environment steps, acted by the state prior instead of the actor.
         env_steps: environment steps of the online phase, over all environments.
-        replay_capacity: macro transitions kept.
+        replay_capacity: macro transitions kept, at most; a run allocates no more than it plays.
     """
 
     hidden: tuple[int, ...] = widths(256, 256, 256)
@@ -179,12 +184,14 @@ class HighLevelConfig:
     discount: Scannable = number(0.99, high=1.0)
     target_rate: Scannable = number(0.005, high=1.0, above=True)
     init_temperature: Scannable = number(0.05, above=True)
+    regulariser: str = choice("entropy", "entropy", "prior")
     target_entropy_scale: Scannable = number(0.5)
+    target_divergence: Scannable = number(1.0)
     latent_map: str = choice("arctanh", "arctanh", "box", "prior")
     num_envs: int = count(1)
     warmup_env_steps: int = count(5_000, low=0)
     env_steps: int = count(200_000)
-    replay_capacity: int = count(100_000)
+    replay_capacity: int = count(1_000_000)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.data.segments import macro_return, segment_starts, window
+from qdos_brax.data.segments import episode_last, macro_return, segment_starts, window
 
 
 class Normaliser(struct.PyTreeNode):
@@ -26,6 +26,11 @@ class Normaliser(struct.PyTreeNode):
         """Normalises [..., obs]."""
         return (observation - self.mean) / self.scale
 
+    def repeated(self, members: int) -> dict[str, jax.Array]:
+        """Its fields, with a leading axis of ``members`` copies."""
+        fields = {"mean": self.mean, "scale": self.scale}
+        return {name: jnp.broadcast_to(x, (members, *x.shape)) for name, x in fields.items()}
+
 
 class DeviceData(struct.PyTreeNode):
     """N transitions as device arrays; observations are normalised, rewards and masks are the task's.
@@ -37,6 +42,7 @@ class DeviceData(struct.PyTreeNode):
         rewards: float32[N].
         masks: float32[N].
         starts: int32[S], first rows of all windows of H steps inside one episode.
+        last: int32[N], the last row of each row's episode.
         qpos: float32[N, nq], or None when the file holds no simulator states.
         qvel: float32[N, nv], or None.
     """
@@ -47,6 +53,7 @@ class DeviceData(struct.PyTreeNode):
     rewards: jax.Array
     masks: jax.Array
     starts: jax.Array
+    last: jax.Array
     qpos: jax.Array | None
     qvel: jax.Array | None
 
@@ -72,6 +79,7 @@ def to_device(dataset: Dataset, horizon: int) -> tuple[DeviceData, Normaliser]:
         rewards=jnp.asarray(dataset.rewards),
         masks=jnp.asarray(dataset.masks),
         starts=jnp.asarray(segment_starts(dataset.ends, horizon)),
+        last=jnp.asarray(episode_last(dataset.ends)),
         qpos=None if dataset.qpos is None else jnp.asarray(dataset.qpos),
         qvel=None if dataset.qvel is None else jnp.asarray(dataset.qvel),
     )

@@ -27,6 +27,12 @@ def segment_starts(ends: np.ndarray, horizon: int) -> np.ndarray:
     return np.concatenate(runs) if runs else np.zeros(0, np.int32)
 
 
+def episode_last(ends: np.ndarray) -> np.ndarray:
+    """int32[N], the last row of the episode that each row belongs to; ``ends``: bool[N], the last rows."""
+    bounds = episode_bounds(np.asarray(ends, bool))
+    return np.repeat(bounds[:, 1] - 1, bounds[:, 1] - bounds[:, 0]).astype(np.int32)
+
+
 def window(tree: Tree, starts: jax.Array, horizon: int) -> Tree:
     """The windows that begin at ``starts[B]``: every leaf [N, ...] of ``tree`` becomes [B, horizon, ...].
 

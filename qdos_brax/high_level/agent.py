@@ -1,16 +1,27 @@
-"""A trained agent: which skill to play, and what the skill does."""
+"""A trained agent: which latent to play, and what that does."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 
 from qdos_brax.data.device import Normaliser
 from qdos_brax.high_level.sac import SAC
-from qdos_brax.latent_map import LatentMap, Prior
-from qdos_brax.skills.vae import SkillModel
+from qdos_brax.skills.source import SkillSource
+
+
+class Player(Protocol):
+    """Whatever plays episodes: a decision every H environment steps, and actions in between."""
+
+    def choose(self, observation: jax.Array) -> jax.Array:
+        """The decision at observation[obs], as the environment gives it."""
+        ...
+
+    def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """The action[act] of a decision at an observation."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -19,29 +30,25 @@ class Agent:
 
     Attributes:
         normaliser: of observations.
-        model: the skill model.
+        source: what the high level's action does.
         sac: the high level.
-        latent_map: from its action to the skill.
-        skills: parameters of the skill model.
+        box: half the side of the box of latents.
+        skills: parameters of the source.
         actor: parameters of the high level's actor.
     """
 
     normaliser: Normaliser
-    model: SkillModel
+    source: SkillSource
     sac: SAC
-    latent_map: LatentMap
+    box: jax.Array | float
     skills: Any
     actor: Any
 
     def choose(self, observation: jax.Array) -> jax.Array:
-        """The skill z[..., latent] for observation[..., obs]: the mode of the high level's policy."""
+        """The latent z[..., width] for observation[..., obs]: the mode of the high level's policy."""
         normal = self.normaliser(observation)
-        return self.latent_map.to_latent(self.sac.mode(self.actor, normal), self.prior(normal))
-
-    def prior(self, normal: jax.Array) -> Prior:
-        """p(z | s) at normalised observations[..., obs]."""
-        return Prior(*self.model.prior(self.skills, normal))
+        return self.source.to_latent(self.skills, self.sac.mode(self.actor, normal), normal, self.box)
 
     def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The action[..., act] of skill z at an observation."""
-        return self.model.act(self.skills, self.normaliser(observation), latent)
+        """The action[..., act] of latent z at an observation."""
+        return self.source.act(self.skills, self.normaliser(observation), latent)

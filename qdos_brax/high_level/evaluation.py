@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State
 
 from qdos_brax.high_level.macro_step import macro_step
@@ -58,3 +59,14 @@ def evaluate(
     start = jax.vmap(env.reset)(jax.random.split(key, episodes))
     zeros = jnp.zeros(episodes)
     return jax.lax.while_loop(going, body, (start, Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32))))[1]
+
+
+def summary(episodes: Episodes) -> dict[str, np.ndarray]:
+    """Columns of metrics.csv, [members] each, of episodes[members, N]."""
+    success = np.asarray(episodes.success)
+    return {
+        "eval/success": success.mean(axis=-1),
+        "eval/return": np.asarray(episodes.episode_return).mean(axis=-1),
+        "eval/length": np.asarray(episodes.length).mean(axis=-1),
+        "eval/episodes": np.full(success.shape[0], success.shape[-1]),
+    }

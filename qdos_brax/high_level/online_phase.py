@@ -1,4 +1,4 @@
-"""The last phase: the high level learns online which skill to play, with the data's help."""
+"""The last phase: the high level learns online which skill (or action) to play, with or without the data's help."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData, MacroRows, Normaliser, macro_rows
 from qdos_brax.high_level import replay as replay_buffer
 from qdos_brax.high_level.agent import Agent
-from qdos_brax.high_level.evaluation import Episodes, evaluate
+from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
+from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
 from qdos_brax.high_level.sac import SAC, Batch, SACHyper, SACState
+from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
-from qdos_brax.labels.rnd import RND, RNDState
-from qdos_brax.latent_map import latent_map
-from qdos_brax.networks import gaussian_sample
 from qdos_brax.population import over_members
-from qdos_brax.skills.vae import SkillModel
+from qdos_brax.skills.source import SkillSource
 
 NEVER = -1
 
@@ -43,7 +42,7 @@ class Learners(struct.PyTreeNode):
     """Everything that learns online."""
 
     sac: SACState
-    rnd: RNDState
+    rnd: Any
     labeller: Any
 
 
@@ -61,6 +60,8 @@ class OnlinePhaseState(struct.PyTreeNode):
         broken: simulations that broke and were reset.
         healthy: False once a parameter stopped being finite; the member is frozen from then on.
         chunk: chunks done.
+        guided: int32[members, num_envs], steps that the guide still takes in each environment's episode; None if there
+            is no guide.
     """
 
     key: jax.Array
@@ -73,13 +74,15 @@ class OnlinePhaseState(struct.PyTreeNode):
     broken: jax.Array
     healthy: jax.Array
     chunk: jax.Array
+    guided: Any
 
 
 class OnlinePhase:
-    """SAC over skills.
+    """SAC over skills, or over actions where the source has none.
 
     Each iteration plays one macro step in every environment, stores them, and makes ``utd`` critic steps, one actor
-    and one temperature step per macro step played. Half of a batch is online experience, half labelled data.
+    and one temperature step per macro step played. Of a batch, ``offline_fraction`` is labelled data, the rest online
+    experience.
 
     Args:
         config: the run's configuration.
@@ -87,8 +90,10 @@ class OnlinePhase:
         data: the data set on the device.
         normaliser: of observations.
         hyper: scannable numbers by dotted key, float32[members] each.
-        model: the frozen skills.
+        source: the frozen skills.
         labeller: gives offline rows their reward and mask.
+        bonus: for novelty.
+        guide: acts for an episode's first steps, or None; it acts step by step, so the horizon must be 1.
         steps_per_chunk: environment steps between two looks of the host.
     """
 
@@ -102,22 +107,26 @@ class OnlinePhase:
         data: DeviceData,
         normaliser: Normaliser,
         hyper: dict[str, jax.Array],
-        model: SkillModel,
+        source: SkillSource,
         labeller: OfflineReward,
+        bonus: Bonus,
+        guide: JumpStart | None = None,
         steps_per_chunk: int = 2_000,
     ) -> None:
         high, self._horizon = config.high_level, config.skills.horizon
         self._config, self._env, self._data, self._normalise = config, env, data, normaliser
-        self._hyper, self._model, self._labeller = hyper, model, labeller
-        width, latent = data.observations.shape[-1], config.skills.latent_dim
-        self._sac = SAC(width, latent, high.hidden, high.ensemble, high.target_subset)
-        self._rnd = RND(width + latent, config.labels.rnd_hidden, config.labels.rnd_features)
+        self._hyper, self._source, self._labeller = hyper, source, labeller
+        self._novelty, self._guide = bonus, guide
+        self._sac = high_level_sac(config, data.observations.shape[-1], source)
         self._offline = round(high.batch_size * high.offline_fraction)
+        if guide is not None and self._horizon != 1:
+            raise ValueError("a guide acts step by step: the horizon must be 1")
 
         per_iteration = high.num_envs * self._horizon
         chunk_steps = min(steps_per_chunk, high.env_steps, config.eval.every_env_steps)
         self._iterations = max(1, chunk_steps // per_iteration)
         self.num_chunks = -(-high.env_steps // (self._iterations * per_iteration))
+        self._capacity = min(high.replay_capacity, self.num_chunks * self._iterations * high.num_envs)
         self._evaluate_every = max(1, round(config.eval.every_env_steps / (self._iterations * per_iteration)))
 
         members = len(hyper["skills.alpha"])
@@ -127,7 +136,7 @@ class OnlinePhase:
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> OnlinePhaseState:
         """Fresh learners, empty replay, environments at their starts."""
-        self._frozen = {"skills": artifacts["skills"], "labels": artifacts["labels"]}
+        self._frozen = {name: artifacts.get(name, {}) for name in ("skills", "labels", "guide")}
         return self._start(key, self._hyper)
 
     def chunk(self, state: OnlinePhaseState) -> tuple[OnlinePhaseState, dict[str, Any]]:
@@ -138,7 +147,7 @@ class OnlinePhase:
         if chunk % self._evaluate_every == 0 or chunk == self.num_chunks:
             started = time.perf_counter()
             state, episodes = self._evaluate(state, self._frozen, self._hyper, self._data)
-            metrics |= _summary(episodes) | {"eval_seconds": time.perf_counter() - started}
+            metrics |= summary(episodes) | {"eval_seconds": time.perf_counter() - started}
         first = np.asarray(state.first_goal_step, np.float64)
         metrics |= {
             "env_steps": np.asarray(state.env_steps),
@@ -150,11 +159,9 @@ class OnlinePhase:
         return state, metrics
 
     def finish(self, state: OnlinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Adds the actor and what it needs to see; labels and advantages are done with."""
-        kept = {name: value for name, value in artifacts.items() if name not in ("labels", "advantage")}
-        members = state.env_steps.shape[0]
-        repeated = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), self._normalise)
-        normaliser = {"mean": repeated.mean, "scale": repeated.scale}
+        """Adds the actor and what it needs to see; labels, advantages and the guide are done with."""
+        kept = {name: value for name, value in artifacts.items() if name not in ("labels", "advantage", "guide")}
+        normaliser = self._normalise.repeated(state.env_steps.shape[0])
         return kept | {"actor": state.learners.sac.actor, "normaliser": normaliser}
 
     # --- One member ------------------------------------------------------------------------------------------
@@ -166,13 +173,13 @@ class OnlinePhase:
         row = OnlineRow(observation, jnp.zeros(self._sac.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
         learners = Learners(
             sac=self._sac.init(sac_key, hyper["high_level.init_temperature"]),
-            rnd=self._rnd.init(rnd_key),
+            rnd=self._novelty.init(rnd_key),
             labeller=self._labeller.init(labeller_key),
         )
         return OnlinePhaseState(
             key=key,
             learners=learners,
-            replay=replay_buffer.create(row, high.replay_capacity),
+            replay=replay_buffer.create(row, self._capacity),
             env_state=jax.vmap(self._env.reset)(jax.random.split(env_key, high.num_envs)),
             env_steps=jnp.zeros((), jnp.int32),
             update=jnp.zeros((), jnp.int32),
@@ -180,6 +187,7 @@ class OnlinePhase:
             broken=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),
             chunk=jnp.zeros((), jnp.int32),
+            guided=None if self._guide is None else self._guide.draw(_guide_key(env_key), high.num_envs),
         )
 
     def _train(
@@ -213,24 +221,32 @@ class OnlinePhase:
     ) -> tuple[OnlinePhaseState, dict[str, jax.Array]]:
         """One macro step in every environment, stored; episodes that are over start anew."""
         num_envs = self._config.high_level.num_envs
-        prior_key, actor_key, reset_key = jax.random.split(key, 3)
+        first_key, actor_key, reset_key = jax.random.split(key, 3)
         agent = self._agent(state.learners.sac.actor, frozen["skills"], hyper)
         observation = self._normalise(state.env_state.obs)
-        prior = agent.prior(observation)
-        from_prior = agent.latent_map.to_action(gaussian_sample(prior_key, *prior), prior)
+        first = self._source.first(agent.skills, first_key, observation, agent.box)
         action = self._sac.act(state.learners.sac.actor, actor_key, observation)
         warmup = state.env_steps < self._config.high_level.warmup_env_steps
-        action = jnp.where(warmup, from_prior, action)
+        action = jnp.where(warmup, first, action)
+        if self._guide is not None:
+            guide_action = self._guide.sample(frozen["guide"], _guide_key(actor_key), observation)
+            guide_action = self._source.to_action(agent.skills, guide_action, observation, agent.box)
+            action = jnp.where(state.guided[:, None] > 0, guide_action, action)
+        latent = self._source.to_latent(agent.skills, action, observation, agent.box)
         discount = hyper["high_level.discount"]
 
         def one(env_state: State, latent: jax.Array) -> tuple[State, MacroStep]:
             return macro_step(self._env, lambda obs: agent.play(obs, latent), env_state, self._horizon, discount)
 
-        env_state, result = jax.vmap(one)(state.env_state, agent.latent_map.to_latent(action, prior))
+        env_state, result = jax.vmap(one)(state.env_state, latent)
         rows = OnlineRow(observation, action, result.reward, result.mask, self._normalise(result.next_observation))
         keys = jax.random.split(reset_key, num_envs)
         env_steps = state.env_steps + jnp.sum(result.steps)
         reached = jnp.any(result.success > 0) & (state.first_goal_step == NEVER)
+        if self._guide is not None:
+            over = (env_state.done > 0.5) | ~result.finite
+            fresh = self._guide.draw(_guide_key(reset_key), num_envs)
+            state = state.replace(guided=jnp.where(over, fresh, jnp.maximum(state.guided - 1, 0)))
         state = state.replace(
             replay=replay_buffer.insert(state.replay, rows, result.finite),
             env_state=jax.vmap(partial(reset_done, self._env))(env_state, ~result.finite, keys),
@@ -263,29 +279,32 @@ class OnlinePhase:
             target_rate=hyper["high_level.target_rate"],
             target_entropy=-hyper["high_level.target_entropy_scale"] * self._sac.action_dim,
         )
+        reference = None
+        if high.regulariser == "prior":
+            sac_hyper = sac_hyper.replace(target_entropy=-hyper["high_level.target_divergence"])
+            box = hyper["skills.latent_box"]
+            reference = lambda obs, action: self._source.log_prior(frozen["skills"], action, obs, box)  # noqa: E731
         sample = partial(self._sample, learners, replay, frozen=frozen, hyper=hyper, data=data)
 
         def critic_step(sac: SACState, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
             batch_key, update_key = jax.random.split(key)
-            return self._sac.update_critic(sac, sample(batch_key), update_key, sac_hyper)
+            return self._sac.update_critic(sac, sample(batch_key), update_key, sac_hyper, reference)
 
         sac, critic_info = jax.lax.scan(critic_step, learners.sac, jax.random.split(critic_key, high.utd))
         batch_key, update_key = jax.random.split(actor_key)
-        sac, actor_info = self._sac.update_actor(sac, sample(batch_key).observation, update_key, sac_hyper)
-        bonus = self._bonus(learners.rnd, online.observation, online.action, hyper)
+        sac, actor_info = self._sac.update_actor(sac, sample(batch_key).observation, update_key, sac_hyper, reference)
+        bonus = self._novelty.of(learners.rnd, online.observation, online.action, hyper)
         info = jax.tree.map(jnp.mean, critic_info) | actor_info | {"bonus": jnp.mean(bonus)}
         return learners.replace(sac=sac), info
 
     def _learn_labels(
         self, learners: Learners, online: OnlineRow, hyper: dict[str, jax.Array], active: jax.Array
     ) -> Learners:
-        rnd = self._rnd.update(learners.rnd, online.observation, online.action, hyper["labels.rnd_learning_rate"])
+        rnd = self._novelty.learn(learners.rnd, online.observation, online.action, hyper, active)
         rows = MacroRows(online.observation, online.reward, online.mask, online.next_observation)
         rate = hyper["labels.reward_learning_rate"]
         labeller = self._labeller.learn(learners.labeller, rows, online.action, rate, active)
-        return learners.replace(
-            rnd=jax.tree.map(lambda a, b: jnp.where(active, a, b), rnd, learners.rnd), labeller=labeller
-        )
+        return learners.replace(rnd=rnd, labeller=labeller)
 
     def _sample(
         self,
@@ -296,23 +315,27 @@ class OnlinePhase:
         hyper: dict[str, jax.Array],
         data: DeviceData,
     ) -> Batch:
-        """A batch, offline rows first; the bonus for novelty is on all of them."""
+        """A batch, offline rows first, with the bonus for novelty."""
         online_key, offline_key = jax.random.split(key)
-        online = replay_buffer.sample(replay, online_key, self._config.high_level.batch_size - self._offline)
-        index = jax.random.randint(offline_key, (self._offline,), 0, data.starts.shape[0])
+        rows = replay_buffer.sample(replay, online_key, self._config.high_level.batch_size - self._offline)
+        if self._offline:
+            offline = self._sample_offline(learners, offline_key, frozen, hyper, data)
+            rows = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), offline, rows)
+        bonus = self._novelty.of(learners.rnd, rows.observation, rows.action, hyper)
+        if self._config.labels.bonus_rows == "online":
+            bonus = jnp.where(jnp.arange(len(rows.reward)) < self._offline, 0.0, bonus)
+        return Batch(rows.observation, rows.action, rows.reward + bonus, rows.mask, rows.next_observation)
+
+    def _sample_offline(
+        self, learners: Learners, key: jax.Array, frozen: Any, hyper: dict[str, jax.Array], data: DeviceData
+    ) -> OnlineRow:
+        """Labelled segments, with the reward and mask that they are given."""
+        index = jax.random.randint(key, (self._offline,), 0, data.starts.shape[0])
         action = frozen["labels"][index]
         discount = hyper["high_level.discount"]
         rows = macro_rows(data, data.starts[index], self._horizon, discount)
         reward, mask = self._labeller.label(learners.labeller, rows, action, discount)
-        offline = OnlineRow(rows.observation, action, reward, mask, rows.next_observation)
-        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), offline, online)
-        bonus = self._bonus(learners.rnd, both.observation, both.action, hyper)
-        return Batch(both.observation, both.action, both.reward + bonus, both.mask, both.next_observation)
-
-    def _bonus(
-        self, rnd: RNDState, observation: jax.Array, action: jax.Array, hyper: dict[str, jax.Array]
-    ) -> jax.Array:
-        return hyper["labels.rnd_coefficient"] * self._rnd.error(rnd.predictor, rnd.target, observation, action)
+        return OnlineRow(rows.observation, action, reward, mask, rows.next_observation)
 
     def _play_episodes(
         self, state: OnlinePhaseState, frozen: Any, hyper: dict[str, jax.Array], data: DeviceData
@@ -332,20 +355,20 @@ class OnlinePhase:
         return state.replace(key=key, first_goal_step=first), episodes
 
     def _agent(self, actor: Any, skills: Any, hyper: dict[str, jax.Array]) -> Agent:
-        to_skill = latent_map(self._config.high_level.latent_map, hyper["skills.latent_box"])
-        return Agent(self._normalise, self._model, self._sac, to_skill, skills, actor)
+        return Agent(self._normalise, self._source, self._sac, hyper["skills.latent_box"], skills, actor)
 
 
 def _all_finite(tree: Any) -> jax.Array:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
-def _summary(episodes: Episodes) -> dict[str, np.ndarray]:
-    """Evaluation metrics, [members] each."""
-    success = np.asarray(episodes.success)
-    return {
-        "eval/success": success.mean(axis=-1),
-        "eval/return": np.asarray(episodes.episode_return).mean(axis=-1),
-        "eval/length": np.asarray(episodes.length).mean(axis=-1),
-        "eval/episodes": np.full(success.shape[0], success.shape[-1]),
-    }
+def high_level_sac(config: Config, observation_dim: int, source: SkillSource) -> SAC:
+    """The high level's learner. SPiRL (Pertsch et al. 2020) has its regulariser in the bootstrap value too."""
+    high = config.high_level
+    regularised = high.regulariser == "prior"
+    return SAC(observation_dim, source.width, high.hidden, high.ensemble, high.target_subset, regularised)
+
+
+def _guide_key(key: jax.Array) -> jax.Array:
+    """A key for the guide beside what ``key`` itself is used for."""
+    return jax.random.fold_in(key, 1)

@@ -6,7 +6,7 @@ may be scanned is an argument, so that members of a population differ along a ``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +17,8 @@ from flax import struct
 from qdos_brax.networks import DiagonalGaussian, Ensemble, tanh_gaussian_sample
 
 Params = Any
+# (observation[B], action[B]) -> log density[B] that the actor is held against; without one, it is uniform (SAC).
+Reference = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 class Batch(NamedTuple):
@@ -30,7 +32,10 @@ class Batch(NamedTuple):
 
 
 class SACHyper(struct.PyTreeNode):
-    """Numbers a scan may vary: learning rate, discount per transition, Polyak rate, target entropy (nats)."""
+    """Numbers a scan may vary: learning rate, discount per transition, Polyak rate, target entropy (nats).
+
+    Held against a reference, the "entropy" is minus the divergence KL(actor || reference).
+    """
 
     learning_rate: jax.Array | float
     discount: jax.Array | float
@@ -115,13 +120,15 @@ class SAC:
         """Q of every critic, [ensemble, ...]."""
         return self.critic.apply(critic, jnp.concatenate([observation, action], axis=-1))
 
-    def target_value(self, state: SACState, key: jax.Array, next_observation: jax.Array) -> jax.Array:
+    def target_value(
+        self, state: SACState, key: jax.Array, next_observation: jax.Array, reference: Reference | None = None
+    ) -> jax.Array:
         """The bootstrap value[B]: min over a random subset of target critics at the actor's action.
 
         Only the chosen heads are evaluated.
         """
         action_key, subset_key = jax.random.split(key)
-        action, log_prob = tanh_gaussian_sample(action_key, *self.actor.apply(state.actor, next_observation))
+        action, log_prob = self._sample(state.actor, action_key, next_observation, reference)
         heads = jax.random.choice(subset_key, self.ensemble, (self.target_subset,), replace=False)
         chosen = jax.tree.map(lambda p: p[heads], state.target_critic)
         value = self._target_heads.apply(chosen, jnp.concatenate([next_observation, action], axis=-1)).min(axis=0)
@@ -134,19 +141,32 @@ class SAC:
         error = self.values(critic, batch.observation, batch.action) - target
         return jnp.mean(jnp.sum(error**2, axis=0))
 
+    def _sample(
+        self, actor: Params, key: jax.Array, observation: jax.Array, reference: Reference | None
+    ) -> tuple[jax.Array, jax.Array]:
+        """The actor's u[B, action_dim] and log pi(u | s), less that of the reference, [B]."""
+        action, log_prob = tanh_gaussian_sample(key, *self.actor.apply(actor, observation))
+        return action, log_prob if reference is None else log_prob - reference(observation, action)
+
     def actor_loss(
-        self, actor: Params, critic: Params, temperature: jax.Array, observation: jax.Array, key: jax.Array
+        self,
+        actor: Params,
+        critic: Params,
+        temperature: jax.Array,
+        observation: jax.Array,
+        key: jax.Array,
+        reference: Reference | None = None,
     ) -> tuple[jax.Array, jax.Array]:
         """mean[temperature log pi(u | s) - mean_i Q_i(s, u)], and the policy's entropy estimate."""
-        action, log_prob = tanh_gaussian_sample(key, *self.actor.apply(actor, observation))
+        action, log_prob = self._sample(actor, key, observation, reference)
         value = self.values(critic, observation, action).mean(axis=0)
         return jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
 
     def update_critic(
-        self, state: SACState, batch: Batch, key: jax.Array, hyper: SACHyper
+        self, state: SACState, batch: Batch, key: jax.Array, hyper: SACHyper, reference: Reference | None = None
     ) -> tuple[SACState, dict[str, jax.Array]]:
         """One step of every critic and of the target ensemble."""
-        bootstrap = self.target_value(state, key, batch.next_observation)
+        bootstrap = self.target_value(state, key, batch.next_observation, reference)
         target = jax.lax.stop_gradient(batch.reward + hyper.discount * batch.mask * bootstrap)
         loss, grads = jax.value_and_grad(self.critic_loss)(state.critic, batch, target)
         critic, moments = adam_step(state.critic, state.critic_moments, grads, hyper.learning_rate)
@@ -155,12 +175,17 @@ class SAC:
         return state.replace(critic=critic, critic_moments=moments, target_critic=target_critic), info
 
     def update_actor(
-        self, state: SACState, observation: jax.Array, key: jax.Array, hyper: SACHyper
+        self,
+        state: SACState,
+        observation: jax.Array,
+        key: jax.Array,
+        hyper: SACHyper,
+        reference: Reference | None = None,
     ) -> tuple[SACState, dict[str, jax.Array]]:
         """One step of the actor, then one of the temperature towards the target entropy."""
         temperature = jnp.exp(state.log_temperature)
         (loss, entropy), grads = jax.value_and_grad(self.actor_loss, has_aux=True)(
-            state.actor, state.critic, temperature, observation, key
+            state.actor, state.critic, temperature, observation, key, reference
         )
         actor, actor_moments = adam_step(state.actor, state.actor_moments, grads, hyper.learning_rate)
         temperature_grad = temperature * (entropy - hyper.target_entropy)

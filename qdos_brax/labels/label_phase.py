@@ -1,8 +1,7 @@
-"""The third phase: which skill each segment of the data played, by the frozen posterior, as the high level's action."""
+"""The phase before the last: what each segment of the data played, by the frozen source, as the high level's action."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,14 +12,14 @@ from flax import struct
 from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import window
-from qdos_brax.latent_map import LatentMap, Prior
 from qdos_brax.networks import gaussian_sample
 from qdos_brax.population import over_members
-from qdos_brax.skills.vae import Segments, SkillModel
+from qdos_brax.skills.source import SkillSource
+from qdos_brax.skills.vae import Segments
 
 
 class LabelPhaseState(struct.PyTreeNode):
-    """Labels so far, every leaf [members, ...]: key, u[S, latent], the next segment to label."""
+    """Labels so far, every leaf [members, ...]: key, u[S, width], the next segment to label."""
 
     key: jax.Array
     action: jax.Array
@@ -34,8 +33,7 @@ class LabelPhase:
         config: the run's configuration.
         data: the data set on the device.
         hyper: scannable numbers by dotted key, float32[members] each.
-        model: posterior, prior and decoder.
-        to_skill: makes the map between u and z from the half side of its box.
+        source: of low-level behaviour.
         chunk_size: segments per chunk.
     """
 
@@ -47,12 +45,11 @@ class LabelPhase:
         config: Config,
         data: DeviceData,
         hyper: dict[str, jax.Array],
-        model: SkillModel,
-        to_skill: Callable[[jax.Array], LatentMap],
+        source: SkillSource,
         chunk_size: int = 16_384,
     ) -> None:
-        self._horizon, self._latent_dim = config.skills.horizon, config.skills.latent_dim
-        self._data, self._hyper, self._model, self._to_skill = data, hyper, model, to_skill
+        self._horizon = config.skills.horizon
+        self._data, self._hyper, self._source = data, hyper, source
         self._total = data.starts.shape[0]
         self._size = min(chunk_size, self._total)
         self.num_chunks = -(-self._total // self._size)
@@ -60,9 +57,9 @@ class LabelPhase:
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> LabelPhaseState:
         """No labels yet."""
-        self._skills = artifacts["skills"]
+        self._skills = artifacts.get("skills", {})
         members = key.shape[0]
-        action = jnp.zeros((members, self._total, self._latent_dim))
+        action = jnp.zeros((members, self._total, self._source.width))
         return LabelPhaseState(key, action, jnp.zeros(members, jnp.int32))
 
     def chunk(self, state: LabelPhaseState) -> tuple[LabelPhaseState, dict[str, np.ndarray]]:
@@ -71,7 +68,7 @@ class LabelPhase:
         return state, {"update": np.asarray(state.position)}
 
     def finish(self, state: LabelPhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Adds the labels, float32[members, S, latent]."""
+        """Adds the labels, float32[members, S, width]."""
         return artifacts | {"labels": state.action}
 
     def _label(self, state: LabelPhaseState, skills: Any, hyper: Any, data: DeviceData) -> LabelPhaseState:
@@ -82,11 +79,11 @@ class LabelPhase:
 
         def encode(start: jax.Array) -> tuple[jax.Array, jax.Array]:
             segment = window((data.observations, data.actions), start[None], self._horizon)
-            mean, log_std = self._model.encode(skills, Segments(*segment))
+            after = data.next_observations[start + self._horizon - 1]
+            mean, log_std = self._source.posterior(skills, Segments(*segment), after[None])
             return mean[0], log_std[0]
 
         mean, log_std = jax.lax.map(encode, starts, batch_size=min(1024, self._size))
         latent = gaussian_sample(sample_key, mean, log_std)
-        prior = Prior(*self._model.prior(skills, data.observations[starts]))
-        action = self._to_skill(hyper["skills.latent_box"]).to_action(latent, prior)
+        action = self._source.to_action(skills, latent, data.observations[starts], hyper["skills.latent_box"])
         return LabelPhaseState(key, jax.lax.dynamic_update_slice(state.action, action, (first, 0)), first + self._size)

@@ -1,33 +1,85 @@
-"""The methods, each a recipe of the same parts; ``build`` puts the parts together."""
+"""The methods, each a recipe of the same parts; ``build`` puts the parts together. To add a method is to add a recipe.
+
+A recipe holds the numbers that its authors published, by dotted configuration key; they are laid over the task's YAML
+and under the preset, the flags and ``--set`` (``qdos_brax.config``). Published numbers that agree with the defaults
+are not repeated.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a method switches on.
+    """What a method is made of.
 
     Attributes:
         summary: one line for a list of methods.
+        source: of low-level behaviour: "trajectory" (a VAE of segments) or "action" (none: the policy acts itself).
         weighted: segments are weighted by their advantage (else all count the same, and no values are learned).
         information: the mutual-information term is on.
-        offline_reward: reward of offline rows, or None for what ``labels.offline_reward`` says.
+        settings: published values by dotted key.
+        by_family: the same, for single task families.
     """
 
     summary: str
-    weighted: bool
-    information: bool
-    offline_reward: str | None = None
+    source: str = "trajectory"
+    weighted: bool = False
+    information: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    by_family: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
+
+_MANIPULATION = ("cube", "kitchen", "scene")
+
+# What an offline row earns without its reward: the least there is on the mazes, what a model of the online rewards
+# predicts in manipulation (Wilcoxson et al. 2025, appendix and published commands; the ball's tasks as the mazes).
+_UNLABELLED = {"labels.offline_reward": "min"}
+_UNLABELLED_BY_FAMILY = {family: {"labels.offline_reward": "pred"} for family in _MANIPULATION}
+
+# Nothing of the data but the skills.
+_ONLINE_ONLY = {"high_level.offline_fraction": 0.0, "labels.bonus_rows": "online"}
+
+# One action per decision, one step per segment.
+_FLAT = {"skills.horizon": 1, "values.n_step": 1}
 
 METHODS = {
     "qdos": Recipe("advantage-weighted, diverse skills; rewards of the data", weighted=True, information=True),
+    # Wilcoxson et al. 2025, "Leveraging Skills from Unlabeled Prior Data for Efficient Online Exploration". Their code
+    # has skills.horizon=4, the comparison in the QDOS paper 20.
     "supe": Recipe(
-        "unweighted skills; the lowest reward for offline rows (Wilcoxson et al. 2025)",
-        weighted=False,
-        information=False,
-        offline_reward="min",
+        "unweighted skills; the data without its rewards, novelty made up for (Wilcoxson et al. 2025)",
+        settings=_UNLABELLED,
+        by_family=_UNLABELLED_BY_FAMILY,
+    ),
+    # Ajay et al. 2021 (OPAL), Pertsch et al. 2020 (SPiRL: with high_level.regulariser=prior); online as in
+    # Wilcoxson et al. 2025, "online w/ trajectory skills".
+    "trajectory-skills": Recipe(
+        "SUPE's skills, learned with online alone (OPAL, Ajay et al. 2021; SPiRL, Pertsch et al. 2020)",
+        settings=_ONLINE_ONLY,
+        # SPiRL's target divergence: 1 in the maze, 5 in the kitchen (appendix).
+        by_family={family: {"high_level.target_divergence": 5.0} for family in _MANIPULATION},
+    ),
+    # Li et al. 2023, "Accelerating exploration with unlabeled prior data"; the coefficient as SUPE's authors run it.
+    "explore": Recipe(
+        "no skills; the data without its rewards, novelty made up for (ExPLORe, Li et al. 2023)",
+        source="action",
+        settings=_FLAT | _UNLABELLED | {"labels.rnd_coefficient": 2.0},
+        by_family=_UNLABELLED_BY_FAMILY,
+    ),
+    # Ball et al. 2023, "Efficient online reinforcement learning with offline data".
+    "rlpd": Recipe(
+        "no skills; SAC with an ensemble, half of each batch from the data (RLPD, Ball et al. 2023)",
+        source="action",
+        settings=_FLAT | {"labels.rnd_coefficient": 0.0},
     ),
 }
+
+
+def settings(method: str, family: str) -> dict[str, Any]:
+    """A recipe's published values for a task family, by dotted key."""
+    recipe = METHODS[method]
+    return {**recipe.settings, **recipe.by_family.get(family, {})}

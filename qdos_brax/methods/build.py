@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,14 +16,14 @@ from qdos_brax.config import Config
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.errors import UserError
-from qdos_brax.high_level.agent import Agent
+from qdos_brax.high_level.agent import Agent, Player
 from qdos_brax.high_level.evaluation import evaluate
-from qdos_brax.high_level.online_phase import OnlinePhase
-from qdos_brax.high_level.sac import SAC
+from qdos_brax.high_level.online_phase import OnlinePhase, high_level_sac
+from qdos_brax.labels.bonus import Bonus, NoBonus, RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, OfflineReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
-from qdos_brax.latent_map import latent_map
+from qdos_brax.labels.rnd import RND
 from qdos_brax.methods import METHODS, Recipe
 from qdos_brax.population import over_members
 from qdos_brax.runs.checkpoint import final_artifacts
@@ -34,6 +33,7 @@ from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, SegmentWeights, UniformWeights
 from qdos_brax.skills.skill_phase import Information, SkillPhase
+from qdos_brax.skills.source import ActionSource, SkillSource, TrajectorySource
 from qdos_brax.skills.vae import SkillModel
 from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
@@ -50,29 +50,92 @@ def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
     Raises:
         UserError: the data cannot serve this configuration.
     """
-    recipe = METHODS[config.method]
+    task = _task(config, env, dataset)
+    high = config.high_level
+    source = make_source(config, env)
+    labelled = round(high.batch_size * high.offline_fraction) > 0
+    return [
+        *_SOURCES[task.recipe.source].phases(task),
+        *([LabelPhase(config, task.data, task.hyper, source)] if labelled else []),
+        OnlinePhase(
+            config,
+            env,
+            task.data,
+            task.normaliser,
+            task.hyper,
+            source,
+            _labeller(config, env, source),
+            _bonus(config, env, source),
+        ),
+    ]
+
+
+def make_source(config: Config, env: Any) -> SkillSource:
+    """The method's source of low-level behaviour."""
+    return _SOURCES[METHODS[config.method].source].make(config, env)
+
+
+class _Task(NamedTuple):
+    """What every phase of a run is made from."""
+
+    config: Config
+    recipe: Recipe
+    env: Any
+    dataset: Dataset
+    data: DeviceData
+    normaliser: Normaliser
+    hyper: dict[str, jax.Array]
+
+
+def _task(config: Config, env: Any, dataset: Dataset) -> _Task:
     data, normaliser = to_device(dataset, config.skills.horizon)
     if data.starts.shape[0] == 0:
         raise UserError(
             f"no episode of {dataset.source} has {config.skills.horizon} steps, the length of a skill "
             "(--set skills.horizon=N shortens it)"
         )
-    if config.values.n_step > config.skills.horizon:
+    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    return _Task(config, METHODS[config.method], env, dataset, data, normaliser, hyper)
+
+
+class _Source(NamedTuple):
+    """A kind of low-level behaviour: how it is made, and the phases that learn it."""
+
+    make: Callable[[Config, Any], SkillSource]
+    phases: Callable[[_Task], list[Phase]]
+
+
+def _trajectory_source(config: Config, env: Any) -> SkillSource:
+    return TrajectorySource(_skill_model(config, env), config.high_level.latent_map)
+
+
+def _trajectory_phases(task: _Task) -> list[Phase]:
+    config, recipe, env, data = task.config, task.recipe, task.env, task.data
+    if recipe.weighted and config.values.n_step > config.skills.horizon:
         raise UserError(
             f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({config.skills.horizon})"
         )
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
     model = _skill_model(config, env)
-    weights = _weights(config, recipe, env)
-    information = _information(config, recipe, env, model, normaliser, data)
-    labeller = _labeller(config, recipe, env)
-
+    information = _information(config, recipe, env, model, task.normaliser, data)
     return [
-        *([value_phase(config, env, dataset, data, hyper)] if recipe.weighted else []),
-        SkillPhase(config, data, hyper, model, weights, information),
-        LabelPhase(config, data, hyper, model, partial(latent_map, config.high_level.latent_map)),
-        OnlinePhase(config, env, data, normaliser, hyper, model, labeller),
+        *([value_phase(config, env, task.dataset, data, task.hyper)] if recipe.weighted else []),
+        SkillPhase(config, data, task.hyper, model, _weights(config, recipe, env), information),
     ]
+
+
+def _action_source(config: Config, env: Any) -> SkillSource:
+    if config.skills.horizon != 1:
+        raise UserError(
+            f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, "
+            f"not {config.skills.horizon}"
+        )
+    return ActionSource(env.action_size)
+
+
+_SOURCES = {
+    "trajectory": _Source(_trajectory_source, _trajectory_phases),
+    "action": _Source(_action_source, lambda task: []),
+}
 
 
 def value_phase(
@@ -92,14 +155,14 @@ class TrainedRun(NamedTuple):
         env: its task.
         artifacts: parameters with a leading member axis.
         hyper: what a scan may vary, by dotted key, with a leading member axis.
-        agent: (artifacts, hyper) of one member -> its agent.
+        agent: (artifacts, hyper) of one member -> what plays.
     """
 
     config: Config
     env: Any
     artifacts: Any
     hyper: dict[str, jax.Array]
-    agent: Callable[[Any, Any], Agent]
+    agent: Callable[[Any, Any], Player]
 
 
 def load_run(run: Path) -> TrainedRun:
@@ -116,17 +179,16 @@ def load_run(run: Path) -> TrainedRun:
     if folder.read_summary() is None:
         raise UserError(f"the run in {run} has not ended; go on with: python train.py --resume {run}")
     env = envs.make(config.env, physics=config.physics)
-    high = config.high_level
-    sac = SAC(env.observation_size, config.skills.latent_dim, high.hidden, high.ensemble, high.target_subset)
-    model = _skill_model(config, env)
+    source = make_source(config, env)
+    sac = high_level_sac(config, env.observation_size, source)
 
-    def agent(artifacts: Any, hyper: Any) -> Agent:
+    def agent(artifacts: Any, hyper: Any) -> Player:
         return Agent(
             normaliser=Normaliser(**artifacts["normaliser"]),
-            model=model,
+            source=source,
             sac=sac,
-            latent_map=latent_map(high.latent_map, hyper["skills.latent_box"]),
-            skills=artifacts["skills"],
+            box=hyper["skills.latent_box"],
+            skills=artifacts.get("skills", {}),
             actor=artifacts["actor"],
         )
 
@@ -208,11 +270,18 @@ def _information(
     return PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
 
 
-def _labeller(config: Config, recipe: Recipe, env: Any) -> OfflineReward:
-    kind = recipe.offline_reward or config.labels.offline_reward
-    if kind == "data":
+def _labeller(config: Config, env: Any, source: SkillSource) -> OfflineReward:
+    labels = config.labels
+    if labels.offline_reward == "data":
         return DataReward()
-    model = RewardModel(env.observation_size + config.skills.latent_dim, config.labels.reward_hidden)
-    if kind == "pred":
+    model = RewardModel(env.observation_size + source.width, labels.reward_hidden)
+    if labels.offline_reward == "pred":
         return PredictedReward(model)
     return MinimumReward(model, config.skills.horizon)
+
+
+def _bonus(config: Config, env: Any, source: SkillSource) -> Bonus:
+    labels = config.labels
+    if labels.rnd_coefficient == 0:
+        return NoBonus()
+    return RNDBonus(RND(env.observation_size + source.width, labels.rnd_hidden, labels.rnd_features))

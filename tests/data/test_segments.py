@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qdos_brax.data.dataset import episode_bounds
-from qdos_brax.data.segments import macro_return, segment_starts, window
+from qdos_brax.data.segments import episode_last, macro_return, segment_starts, window
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -22,6 +22,11 @@ def test_windows_are_exactly_those_inside_one_episode(seed: int) -> None:
 def test_no_rows_give_no_windows() -> None:
     assert segment_starts(np.zeros(0, bool), 4).shape == (0,)
     assert episode_bounds(np.zeros(0, bool)).shape == (0, 2)
+
+
+def test_last_row_of_every_episode() -> None:
+    assert episode_last(np.array([0, 0, 1, 1, 0, 0], bool)).tolist() == [2, 2, 2, 3, 5, 5]  # an open end ends too
+    assert episode_last(np.zeros(0, bool)).shape == (0,)
 
 
 def test_horizon_zero_is_refused() -> None:

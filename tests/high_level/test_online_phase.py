@@ -1,7 +1,5 @@
 """Phase 2 on the plane: it finds the goal, learns from what it should, and repeats."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +8,14 @@ import pytest
 from qdos_brax import config as configs
 from qdos_brax.data.device import MacroRows, to_device
 from qdos_brax.high_level.online_phase import OnlinePhase
+from qdos_brax.labels.bonus import RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
-from qdos_brax.latent_map import BoxMap, latent_map
 from qdos_brax.skills.segment_weights import UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
+from qdos_brax.skills.source import TrajectorySource
 from qdos_brax.skills.vae import SkillModel
 from tests.point import PointEnv, point_config, point_dataset
 
@@ -25,24 +24,25 @@ SKILLS = {"skills.updates": 600, "skills.learning_rate": 3e-3, "skills.kl_weight
 
 @pytest.fixture(scope="module")
 def plane():
-    """(data, normaliser, model, artifacts of one member with trained skills and labels)."""
+    """(data, normaliser, source, artifacts of one member with trained skills and labels)."""
     config = point_config(**SKILLS)
     data, normaliser = to_device(point_dataset(), config.skills.horizon)
     hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
     model = SkillModel(2, 2, config.skills.latent_dim, 16, 1, (32, 32), (32, 32))
     seeds = np.zeros(1, np.uint32)
     artifacts = run(SkillPhase(config, data, hyper, model, UniformWeights(), None), phase_keys(seeds, 0), {})
-    to_skill = partial(latent_map, config.high_level.latent_map)
-    artifacts = run(LabelPhase(config, data, hyper, model, to_skill), phase_keys(seeds, 1), artifacts)
-    return data, normaliser, model, artifacts
+    source = TrajectorySource(model, config.high_level.latent_map)
+    artifacts = run(LabelPhase(config, data, hyper, source), phase_keys(seeds, 1), artifacts)
+    return data, normaliser, source, artifacts
 
 
 def online_phase(plane, config):
     """(phase, artifacts, keys) for the members of ``config``, on the shared skills."""
-    data, normaliser, model, artifacts = plane
+    data, normaliser, source, artifacts = plane
     hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
-    phase = OnlinePhase(config, PointEnv(), data, normaliser, hyper, model, DataReward(), steps_per_chunk=100)
+    bonus = RNDBonus(RND(2 + source.width, config.labels.rnd_hidden, config.labels.rnd_features))
+    phase = OnlinePhase(config, PointEnv(), data, normaliser, hyper, source, DataReward(), bonus, steps_per_chunk=100)
     repeated = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), artifacts)
     return phase, repeated, phase_keys(seeds, 2)
 
@@ -156,8 +156,9 @@ def test_labels_are_samples_of_the_posterior():
     encoder = jax.tree.map(jnp.zeros_like, params["encoder"])
     encoder["params"]["Dense_0"]["bias"] = jnp.array([1.0, -2.0, -5.0, -5.0])  # mean (1, -2), deviation exp(-5)
     artifacts = {"skills": jax.tree.map(lambda x: x[None], params | {"encoder": encoder})}
+    config = configs.replace(config, **{"skills.latent_box": 10.0})
     hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
-    phase = LabelPhase(config, data, hyper, model, lambda half_side: BoxMap(10.0), chunk_size=1000)
+    phase = LabelPhase(config, data, hyper, TrajectorySource(model, "box"), chunk_size=1000)
     assert phase.num_chunks > 1
     labels = run(phase, phase_keys(np.zeros(1, np.uint32), 0), artifacts)["labels"]
     assert labels.shape == (1, data.starts.shape[0], 2)

@@ -111,7 +111,9 @@ def test_configuration_and_provenance_are_told(page: tuple[Page, int]) -> None:
 
 def test_foreign_names_stay_text(tmp_path: Path) -> None:
     evil = "</script><script>alert(1)</script>"
-    run = write_run(tmp_path / "a", evil, [0.5, 0.7])
+    run = write_run(tmp_path / "a", success=[0.5, 0.7])
+    summary = json.loads((run / "summary.json").read_text())
+    (run / "summary.json").write_text(json.dumps({**summary, "method": evil}))
     write_page(read_study([run]), tmp_path / "report.html")
     parsed = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert len(parsed.scripts) == 3 and evil in "".join(parsed.words)

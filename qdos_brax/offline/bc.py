@@ -1,0 +1,78 @@
+"""Behaviour cloning: the policy that makes the logged actions most likely, each transition by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from qdos_brax.data.device import DeviceData
+from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.offline.policy import GaussianPolicy, Params, weighted_imitation_loss
+from qdos_brax.offline.rows import random_rows
+
+
+class BCState(struct.PyTreeNode):
+    """Parameters of the policy and Adam's moments."""
+
+    actor: Params
+    moments: optax.OptState
+
+
+class BC:
+    """The learner (``qdos_brax.offline.learner.Learner``).
+
+    Args:
+        observation_dim: width of observations.
+        action_dim: width of actions.
+        hidden: hidden widths of the policy.
+        batch_size: transitions per gradient step.
+        learned_std: a Gaussian policy; False makes it deterministic (least squares).
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        hidden: Sequence[int],
+        batch_size: int,
+        learned_std: bool = True,
+    ) -> None:
+        self.observation_dim, self.action_dim, self.batch_size = observation_dim, action_dim, batch_size
+        self.policy = GaussianPolicy(tuple(hidden), action_dim, learned_std)
+
+    def init(self, key: jax.Array) -> BCState:
+        """Fresh parameters."""
+        actor = self.policy.init(key, jnp.zeros((1, self.observation_dim)))
+        return BCState(actor, ADAM.init(actor))
+
+    def act(self, params: dict[str, Any], observation: jax.Array) -> jax.Array:
+        """The mode of the policy, [..., act] in [-1, 1]; ``observation`` is normalised."""
+        return self.policy.apply(params["actor"], observation)[0]
+
+    def step(
+        self, state: BCState, observation: jax.Array, action: jax.Array, learning_rate: jax.Array | float
+    ) -> tuple[BCState, dict[str, jax.Array]]:
+        """One gradient step on observation[B, obs], action[B, act]."""
+
+        def loss(actor: Params) -> jax.Array:
+            return weighted_imitation_loss(self.policy, actor, observation, action, 1.0)
+
+        value, grads = jax.value_and_grad(loss)(state.actor)
+        actor, moments = adam_step(state.actor, state.moments, grads, learning_rate)
+        return BCState(actor, moments), {"actor_loss": value}
+
+    def update(
+        self, state: BCState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]
+    ) -> tuple[BCState, dict[str, jax.Array]]:
+        """One gradient step on a batch of the data; reads ``policy.learning_rate``."""
+        rows = random_rows(data, key, self.batch_size)
+        return self.step(state, data.observations[rows], data.actions[rows], hyper["policy.learning_rate"])
+
+    def params(self, state: BCState) -> dict[str, Any]:
+        """{"actor"}."""
+        return {"actor": state.actor}

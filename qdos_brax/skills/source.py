@@ -1,0 +1,138 @@
+"""Where low-level behaviour comes from, behind one interface: what the high level's action u does, and what played it.
+
+The high level acts by u in (-1, 1)^d. A source says which latent z that is in a state, which action z takes, and which
+z a segment of the data played. ``params`` is always what the source's own learner left, one member's.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from qdos_brax.latent_map import MARGIN, Prior, latent_map
+from qdos_brax.networks import gaussian_log_prob, gaussian_sample
+from qdos_brax.skills.vae import Posterior, Segments, SkillModel
+
+Box = jax.Array | float  # half the side of the box of latents, ``skills.latent_box``
+
+
+class SkillSource(Protocol):
+    """A source of low-level behaviour. Observations are normalised; leading axes are free but for ``posterior``.
+
+    Attributes:
+        width: of u and z.
+    """
+
+    width: int
+
+    def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
+        """q(z | segment), [B, width] each; log_std is -inf where z is known exactly.
+
+        Args:
+            params: of the source.
+            segments: windows of the data.
+            after: [B, obs], the observation behind each window's last action.
+        """
+        ...
+
+    def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """z[..., width] that u[..., width] plays, begun at observation[..., obs]."""
+        ...
+
+    def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """u[..., width] that plays z, inside the box."""
+        ...
+
+    def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """A random u[..., width], for the first steps online."""
+        ...
+
+    def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """Log density[...] of ``first`` at u."""
+        ...
+
+    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """The action[..., act] of z, in [-1, 1]."""
+        ...
+
+
+class TrajectorySource:
+    """The trajectory VAE: z says what a whole segment does.
+
+    Args:
+        model: posterior, prior and decoder.
+        map_name: of the map between u and z ("arctanh", "box" or "prior").
+    """
+
+    def __init__(self, model: SkillModel, map_name: str) -> None:
+        self.width = model.latent_dim
+        self._model, self._map_name = model, map_name
+
+    def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
+        """The encoder's."""
+        return self._model.encode(params, segments)
+
+    def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """By the map."""
+        return latent_map(self._map_name, box).to_latent(action, self._prior(params, observation))
+
+    def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """By the map."""
+        return latent_map(self._map_name, box).to_action(latent, self._prior(params, observation))
+
+    def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """z ~ p(z | s) (SUPE)."""
+        prior = self._prior(params, observation)
+        return latent_map(self._map_name, box).to_action(gaussian_sample(key, *prior), prior)
+
+    def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """log p(z(u) | s) + log |dz / du|."""
+        prior = self._prior(params, observation)
+        mapping = latent_map(self._map_name, box)
+        latent = mapping.to_latent(action, prior)
+        return gaussian_log_prob(latent, *prior) + mapping.log_jacobian(action, prior)
+
+    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """The decoder's mean."""
+        return self._model.act(params, observation, latent)
+
+    def _prior(self, params: Any, observation: jax.Array) -> Prior:
+        return Prior(*self._model.prior(params, observation))
+
+
+class ActionSource:
+    """No skills: u is the action itself, and a segment is one step (RLPD, ExPLORe).
+
+    Args:
+        action_dim: width of actions.
+    """
+
+    def __init__(self, action_dim: int) -> None:
+        self.width = action_dim
+
+    def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
+        """The segment's own action."""
+        action = segments.actions[:, 0]
+        return Posterior(action, jnp.full_like(action, -jnp.inf))
+
+    def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """z = u."""
+        return action
+
+    def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """u = z, where the actor's density is finite."""
+        return jnp.clip(latent, -1 + MARGIN, 1 - MARGIN)
+
+    def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """Uniform over the actions."""
+        return jax.random.uniform(key, (*observation.shape[:-1], self.width), minval=-1.0)
+
+    def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """That of the uniform distribution."""
+        return jnp.full(action.shape[:-1], -self.width * jnp.log(2.0))
+
+    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """z itself."""
+        return latent

@@ -1,0 +1,61 @@
+"""Behaviour cloning against the empirical distribution of the actions in each state."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qdos_brax.offline.bc import BC
+from tests.offline.gridworld import device_data
+from tests.offline.training import train, train_members
+
+STATES = 5
+
+
+@pytest.fixture(scope="module")
+def logged():
+    """In state s the first action dimension is +0.8 with frequency (s + 1) / 7, else -0.8; the second is noise."""
+    rng = np.random.default_rng(0)
+    state = rng.integers(0, STATES, 2000)
+    first = np.where(rng.random(2000) < (state + 1) / 7, 0.8, -0.8)
+    action = np.stack([first, np.clip(0.2 * rng.normal(size=2000), -1, 1)], axis=-1)
+    return state, action, device_data(np.eye(STATES)[state], action)
+
+
+def test_a_gaussian_policy_has_the_empirical_means_and_spread(logged):
+    state, action, data = logged
+    learner = BC(STATES, 2, (32,), batch_size=256)
+    trained, _ = train(learner, data, {"policy.learning_rate": 3e-3}, 1500)
+    mean, log_std = learner.policy.apply(trained.actor, jnp.eye(STATES))
+    empirical = np.stack([action[state == s].mean(axis=0) for s in range(STATES)])
+    np.testing.assert_allclose(mean, empirical, atol=0.08)
+    # The likeliest common deviation is the root mean square of the residuals of all states together.
+    residual = action - empirical[state]
+    np.testing.assert_allclose(np.exp(log_std), np.sqrt((residual**2).mean(axis=0)), rtol=0.05)
+    # The frequencies of +0.8, read off the mean: p = (1 + mean / 0.8) / 2.
+    frequency = [(action[state == s, 0] > 0).mean() for s in range(STATES)]
+    np.testing.assert_allclose((1 + mean[:, 0] / 0.8) / 2, frequency, atol=0.05)
+
+
+def test_a_deterministic_policy_is_least_squares(logged):
+    state, action, data = logged
+    learner = BC(STATES, 2, (32,), batch_size=256, learned_std=False)
+    trained, _ = train(learner, data, {"policy.learning_rate": 3e-3}, 1500)
+    acted = learner.act(learner.params(trained), jnp.eye(STATES))
+    empirical = np.stack([action[state == s].mean(axis=0) for s in range(STATES)])
+    np.testing.assert_allclose(acted, empirical, atol=0.08)
+    # -log N(a; mean, 1) is half the squared error plus log(2 pi) for two dimensions.
+    some = jnp.zeros((3, STATES)), jnp.full((3, 2), 0.5)
+    _, info = jax.jit(learner.step)(trained, *some, 0.0)
+    error = jnp.sum((learner.act(learner.params(trained), some[0]) - some[1]) ** 2, axis=-1)
+    np.testing.assert_allclose(info["actor_loss"], jnp.mean(error) / 2 + np.log(2 * np.pi), rtol=1e-5)
+
+
+def test_members_of_a_population_differ_by_their_numbers_only(logged):
+    _, _, data = logged
+    learner = BC(STATES, 2, (8,), batch_size=16)
+    both = train_members(learner, data, {"policy.learning_rate": np.array([1e-3, 0.0])}, 5)
+    fresh = jax.jit(learner.init)(jax.random.key(1)).actor
+    kernels = [tree["params"]["MLP_0"]["Dense_0"]["kernel"] for tree in (both.actor, fresh)]
+    np.testing.assert_array_equal(kernels[0][1], kernels[1])
+    assert not np.array_equal(kernels[0][0], kernels[1])
