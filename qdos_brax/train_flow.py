@@ -207,6 +207,13 @@ def _announce(config: Config, asked: Config, chosen: bool) -> None:
 
 def _conclude(folder: RunFolder, summary: Mapping[str, Any]) -> None:
     """The report, and the last lines: how it went and where things are."""
+    if not folder.inside.exists():
+        from qdos_brax.methods.inside import look_inside  # here, because scikit-learn takes its time
+
+        try:
+            look_inside(folder.path)
+        except UserError as error:  # the page does without
+            print(f"inside    left out: {error}", file=sys.stderr, flush=True)
     report = write_report([folder.path], folder.path)
     minutes = summary["wall_seconds"]["total"] / 60
     print(f"\ndone in {minutes:.1f} minutes")

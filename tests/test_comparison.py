@@ -17,6 +17,7 @@ import pytest
 
 from qdos_brax import cli, train_flow
 from qdos_brax.errors import UserError
+from qdos_brax.methods import inside
 from qdos_brax.runs import comparison
 from tests.runs import toy
 
@@ -48,6 +49,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(train_flow, "_default_data", lambda config, env: data)
     monkeypatch.setattr(train_flow.formats, "read", lambda path, env: None)
     monkeypatch.setattr(train_flow, "build_phases", phases)
+    monkeypatch.setattr(inside, "look_inside", lambda path: None)  # toys have nothing inside
     monkeypatch.setattr(train_flow.jax, "clear_caches", lambda: None)  # the other tests' programs are theirs
     return built
 

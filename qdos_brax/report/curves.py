@@ -13,13 +13,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from qdos_brax.report.parts import PALETTE
 from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
 from qdos_brax.report.study import Study, plain, short
 from qdos_brax.runs.folder import replacing
 
 MEASURES = (("eval/success", "success"), ("eval/return", "return"))
-# Okabe and Ito's colours, which differ for colour-blind eyes too; their yellow is too light for a line.
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F3C8D", "#8C6D31", "#A5AA99")
 
 
 def draw_curves(study: Study, out: Path) -> None:

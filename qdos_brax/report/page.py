@@ -10,7 +10,8 @@ from typing import Any
 import jinja2
 
 from qdos_brax.report.curves import colours_of
-from qdos_brax.report.sections import member_id, sections
+from qdos_brax.report.parts import member_id
+from qdos_brax.report.sections import sections
 from qdos_brax.report.study import Study
 from qdos_brax.runs.folder import write_text
 
@@ -38,6 +39,7 @@ def write_page(study: Study, out: Path) -> None:
                 "text": section.text,
                 "tables": section.tables,
                 "figures": shown,
+                "images": section.images,
                 "listings": section.listings,
                 "folded": section.folded,
             }

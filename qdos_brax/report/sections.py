@@ -1,74 +1,27 @@
-"""The parts of the page that need nothing but the run folders' text files: data in, figures out.
-
-A figure is plotly's JSON as a plain dict. ``meta`` on a trace says what the page's filter hides it with: "member" is a
-member's own trace, "setting" one that stands for all members of a setting.
-"""
+"""The parts of the page that need nothing but the run folders' text files: data in, figures out."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any
-
-import numpy as np
+from collections.abc import Iterable
 
 from qdos_brax.config import to_yaml
-from qdos_brax.report.curves import MEASURES, PALETTE, colours_of, positions
+from qdos_brax.report.curves import MEASURES, colours_of, positions
+from qdos_brax.report.inside_sections import inside_sections
+from qdos_brax.report.parts import PALETTE, Figure, Section, Trace, axes, member_id, numbers
 from qdos_brax.report.series import Curve, Scan, curves, scans
 from qdos_brax.report.study import Member, Setting, Study, short
 from qdos_brax.report.tables import Table, tables
 
-Trace = dict[str, Any]
 _PARTS = ("data", "pretrain", "label", "online", "eval")
 _NOT_MEASURES = {"member", "seed", "phase", "env_steps", "update", "status_ok", "first_goal_step"}
-
-
-@dataclasses.dataclass(frozen=True)
-class Figure:
-    """One chart.
-
-    Attributes:
-        title: above it.
-        data: plotly's traces.
-        layout: plotly's layout, without what the page sets for all (fonts, margins, legend).
-    """
-
-    title: str
-    data: list[Trace]
-    layout: dict[str, Any]
-
-
-@dataclasses.dataclass(frozen=True)
-class Section:
-    """One part of the page.
-
-    Attributes:
-        title: its heading.
-        text: how to read it.
-        figures: its charts.
-        tables: its tables.
-        listings: (title, text) of longer texts, folded away.
-        folded: whether the charts are drawn only once the reader opens them.
-    """
-
-    title: str
-    text: str = ""
-    figures: Sequence[Figure] = ()
-    tables: Sequence[Table] = ()
-    listings: Sequence[tuple[str, str]] = ()
-    folded: bool = False
 
 
 def sections(study: Study) -> list[Section]:
     """Everything there is something to show of, in the order of the page."""
     made = (_results(study), _learning(study), _first_goal(study), _scan(study), _wall_time(study), _diagnostics(study))
-    return [section for section in made if section.figures or section.tables] + [_provenance(study)]
-
-
-def member_id(member: Member) -> str:
-    """What the filter calls a member."""
-    return f"{member.run}#{member.task}#{member.seed}#{sorted(member.values.items())}"
+    shown = [section for section in made if section.figures or section.tables]
+    return [*shown[:-1], *inside_sections(study), *shown[-1:], _provenance(study)]
 
 
 def _results(study: Study) -> Section:
@@ -81,7 +34,7 @@ def _learning(study: Study) -> Section:
         Figure(
             f"{name}, {task}",
             [trace for curve in drawn for trace in _curve(curve, colours[curve.setting.label])],
-            _axes("environment steps", name, share=name == "success"),
+            axes("environment steps", name, share=name == "success"),
         )
         for task in study.tasks
         for column, name in MEASURES
@@ -98,20 +51,20 @@ def _curve(curve: Curve, colour: str) -> Iterable[Trace]:
     if curve.offline:
         end = max((float(m.values["high_level.env_steps"]) for m, _ in curve.members), default=1.0)
         line: Trace = {"color": colour, "dash": "dash"}
-        yield {**group, "x": [0, end], "y": _list([curve.mean[-1]] * 2), "name": label, "line": line, "meta": own}
+        yield {**group, "x": [0, end], "y": numbers([curve.mean[-1]] * 2), "name": label, "line": line, "meta": own}
         return
     several = len(curve.members) > 1
     if several:
-        band = {"x": _list([*curve.steps, *curve.steps[::-1]]), "y": _list([*curve.high, *curve.low[::-1]])}
+        band = {"x": numbers([*curve.steps, *curve.steps[::-1]]), "y": numbers([*curve.high, *curve.low[::-1]])}
         fill = {"fill": "toself", "fillcolor": _faint(colour), "line": {"width": 0}, "hoverinfo": "skip"}
         yield {**group, **band, **fill, "name": label, "showlegend": False, "meta": own}
         for member, xy in curve.members:
             line = {"color": colour, "width": 1}
             name = {"name": f"{label}, seed {member.seed}", "showlegend": False, "opacity": 0.5}
             meta = {"member": member_id(member)}
-            yield {**group, **name, "x": _list(xy[0]), "y": _list(xy[1]), "line": line, "meta": meta}
+            yield {**group, **name, "x": numbers(xy[0]), "y": numbers(xy[1]), "line": line, "meta": meta}
     line = {"color": colour, "width": 3}
-    mean = {"x": _list(curve.steps), "y": _list(curve.mean), "line": line, "name": label, "meta": own}
+    mean = {"x": numbers(curve.steps), "y": numbers(curve.mean), "line": line, "name": label, "meta": own}
     yield {**group, **mean, "mode": "lines+markers"}
 
 
@@ -133,7 +86,7 @@ def _first_goal(study: Study) -> Section:
             for setting, member in members
         ]
         if data:
-            layout = _axes("environment steps", "")
+            layout = axes("environment steps", "")
             names = [setting.label for setting in study.settings if task in setting.members]
             layout["yaxis"] |= {"type": "category", "categoryarray": names[::-1], "categoryorder": "array"}
             layout["xaxis"] |= {"rangemode": "tozero"}
@@ -144,7 +97,7 @@ def _first_goal(study: Study) -> Section:
 def _scan(study: Study) -> Section:
     figures = []
     for scan in scans(study):
-        layout = _axes(short(scan.key), "success", share=True)
+        layout = axes(short(scan.key), "success", share=True)
         names = positions(scan.lines[0], scan)[1]
         if names is not None:
             layout["xaxis"] |= {"tickvals": list(range(len(names))), "ticktext": names}
@@ -158,10 +111,10 @@ def _scan_traces(scan: Scan) -> Iterable[Trace]:
     for i, line in enumerate(scan.lines):
         colour, (x, _) = PALETTE[i % len(PALETTE)], positions(line, scan)
         errors = {"type": "data", "symmetric": False, "thickness": 1.5}
-        errors |= {"array": _list(line.high - line.mean), "arrayminus": _list(line.mean - line.low)}
+        errors |= {"array": numbers(line.high - line.mean), "arrayminus": numbers(line.mean - line.low)}
         yield {
             "x": x,
-            "y": _list(line.mean),
+            "y": numbers(line.mean),
             "error_y": errors,
             "mode": "lines+markers",
             "line": {"color": colour, "width": 2},
@@ -194,7 +147,7 @@ def _wall_time(study: Study) -> Section:
         }
         for part, colour in zip(_PARTS, PALETTE, strict=False)
     ]
-    layout = _axes("minutes", "") | {"barmode": "stack"}
+    layout = axes("minutes", "") | {"barmode": "stack"}
     layout["yaxis"] |= {"type": "category", "autorange": "reversed"}
     return Section("Wall time by phase", "Per run folder, all of its members together.", [Figure("", data, layout)])
 
@@ -216,7 +169,7 @@ def _diagnostics(study: Study) -> Section:
         data = [_measure(s, m, phase, name, colours[s.label]) for s, m in everyone if m.task == task]
         data = [trace for trace in data if trace["x"]]
         title = f"{phase}: {name}" + (f", {task}" if len(study.tasks) > 1 else "")
-        figures.append(Figure(title, data, _axes("updates", name)))
+        figures.append(Figure(title, data, axes("updates", name)))
     return Section("Losses and other measures", "One line per member.", figures, folded=True)
 
 
@@ -224,7 +177,7 @@ def _measure(setting: Setting, member: Member, phase: str, name: str, colour: st
     rows = [row for row in member.rows if row["phase"] == phase and row.get(name)]
     return {
         "x": [float(row["update"] or i) for i, row in enumerate(rows)],
-        "y": _list([float(row[name]) for row in rows]),
+        "y": numbers([float(row[name]) for row in rows]),
         "mode": "lines",
         "line": {"color": colour, "width": 1.5},
         "name": f"{setting.label}, seed {member.seed}",
@@ -260,18 +213,6 @@ def _run_name(study: Study, index: int) -> str:
     ]
     name = names[index]
     return name if names.count(name) == 1 else f"{name} ({names[: index + 1].count(name)})"
-
-
-def _axes(x: str, y: str, share: bool = False) -> dict[str, Any]:
-    vertical: dict[str, Any] = {"title": {"text": y}, "automargin": True}
-    if share:
-        vertical |= {"range": [-0.03, 1.03], "tickformat": ".0%"}
-    return {"xaxis": {"title": {"text": x}, "automargin": True}, "yaxis": vertical}
-
-
-def _list(numbers: Iterable[Any]) -> list[float | None]:
-    """Numbers for JSON: five digits, null for what is not finite."""
-    return [float(f"{number:.5g}") if math.isfinite(number) else None for number in np.asarray(list(numbers), float)]
 
 
 def _faint(colour: str) -> str:
