@@ -1,4 +1,4 @@
-"""A look inside a finished run: numbers of a data set made by hand, skills that start where the task does, and the page."""
+"""A look inside a finished run: numbers of a data set made by hand, skills from one start, and the page."""
 
 from __future__ import annotations
 
@@ -59,16 +59,19 @@ def looked(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Pa
     return finished
 
 
+@pytest.mark.slow
 def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
     with np.load(looked / "inside.npz", allow_pickle=False) as file:
         found = dict(file)
     assert found["members"].tolist() == [0]  # the other has the same setting and another seed
     segments = 3 * (20 - HORIZON + 1)
     np.testing.assert_array_equal(found["return"], np.full(segments, -HORIZON))
-    # The goal lies further along than the corridor is walked: ten steps gain one unit, nine where the episode ends.
-    expected = np.ones(segments)
-    expected[10::11] = 0.9
-    np.testing.assert_allclose(np.abs(found["gain"]), expected, atol=1e-4)
+    # Segment 0 goes from x = 0 to 1; the last of each episode from 1 to 1.9, where the log ends.
+    places = np.zeros((3, 15))
+    places[:, 0] = 0, 1, 1.9
+    left = envs.make("antmaze-medium", physics="mujoco").true_distance(places)
+    expected = [left[0] - left[1], *[left[1] - left[2]] * 3]
+    np.testing.assert_allclose(found["gain"][[0, 10, 21, 32]], expected, atol=1e-4)
     assert found["quality"].tolist() == [0] * 11 + [1] * 11 + [2] * 11
     mean = (segments - 1 + 10) / segments
     np.testing.assert_allclose(found["0/weight"], [(10 if i == 1 else 1) / mean for i in range(segments)], rtol=1e-5)
@@ -88,12 +91,8 @@ def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
     written_as_finished(looked)
     study = read_study([looked])
     sections = {section.title: section for section in inside_sections(study)}
-    assert list(sections) == [
-        "Weight against quality",
-        "Latents of segments (t-SNE)",
-        "Where skills lead",
-        "An episode",
-    ]
+    titles = ["Weight against quality", "Latents of segments (t-SNE)", "Where skills lead", "An episode"]
+    assert list(sections) == titles
     dots = sections["Weight against quality"].figures[0].data
     assert [trace["name"] for trace in dots] == ["good", "noisy", "wandering"]
     assert dots[0]["y"][1] == pytest.approx(10 / mean, rel=1e-4)
