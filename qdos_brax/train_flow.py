@@ -68,7 +68,7 @@ def start(make_configs: Callable[[], Sequence[Config]], preset_given: bool, star
     path = Path(first.out or _new_path(first, env, "comparison"))
     members = {config.method: _resolved(config, env, path / config.method) for config in asked}
     comparison.create(path, {method: configs.to_yaml(config) for method, config in members.items()})
-    _compare(path, started)
+    _compare(path, started, chosen=not preset_given)
 
 
 def resume(path: str, started: float) -> None:
@@ -79,19 +79,19 @@ def resume(path: str, started: float) -> None:
     """
     prepare_jax()
     if comparison.is_comparison(path):
-        _compare(Path(path), started)
+        _compare(Path(path), started, chosen=False)
     else:
-        _go_on(RunFolder.open(path), started)
+        _go_on(RunFolder.open(path), started, chosen=False)
 
 
-def _compare(path: Path, started: float) -> None:
+def _compare(path: Path, started: float, chosen: bool) -> None:
     """Runs what has not ended yet of a comparison, and reports on the whole."""
     with RunFolder(path).held():
         folders = comparison.runs(path)
         for number, (method, folder) in enumerate(folders.items(), 1):
             print(f"\n--- {method}, {number} of {len(folders)} methods", flush=True)
             try:
-                _go_on(folder, started)
+                _go_on(folder, started, chosen)
             except UserError as error:
                 raise UserError(f"{method}: {error} (then: python train.py --resume {path})") from error
             except SystemExit:  # a signal; the run has been saved and has said how to go on with it alone
@@ -104,7 +104,7 @@ def _compare(path: Path, started: float) -> None:
     _say_files(report)
 
 
-def _go_on(folder: RunFolder, started: float) -> None:
+def _go_on(folder: RunFolder, started: float, chosen: bool) -> None:
     """Runs what has not been done yet of a run."""
     with folder.held():
         summary = folder.read_summary()
@@ -114,7 +114,7 @@ def _go_on(folder: RunFolder, started: float) -> None:
             return
         config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
         env = _make_env(config)
-        _announce(config, config, chosen=False)
+        _announce(config, config, chosen)
         _run(config, env, folder, started)
 
 
