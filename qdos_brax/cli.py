@@ -82,7 +82,9 @@ def train_parser() -> Parser:
         help="auto, mjx or mujoco (default auto: MuJoCo C where there is only a CPU, MJX on an accelerator)",
     )
     parser.add_argument("--steps", metavar="N", help="environment steps of the online phase")
-    parser.add_argument("--pretrain-steps", metavar="N", help="gradient steps of the values and of the skills, each")
+    parser.add_argument(
+        "--pretrain-steps", metavar="N", help="gradient steps of each thing that is learned from the data alone"
+    )
     parser.add_argument(
         "--set",
         metavar="KEY=VALUE",
@@ -126,6 +128,10 @@ def configs_from_args(args: argparse.Namespace) -> list[Config]:
         "high_level.env_steps": args.steps,
         "values.updates": args.pretrain_steps,
         "skills.updates": args.pretrain_steps,
+        "policy.updates": args.pretrain_steps,
+        "guide.updates": args.pretrain_steps,
+        "hilbert.updates": args.pretrain_steps,
+        "diveoff.updates": args.pretrain_steps,
     }
     flags = {key: value for key, value in by_key.items() if value is not None}
     if args.method is None:

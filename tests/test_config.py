@@ -43,6 +43,7 @@ def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (tmp_path / "antmaze.yaml").write_text("skills: {alpha: 0.3, kl_weight: 0.1, horizon: 10}\nvalues: {n_step: 5}")
     (tmp_path / "antsoccer.yaml").write_text("")
     preset = "skills: {alpha: 0.4, kl_weight: 0.5, horizon: 8}\nfamilies: {antmaze: {skills: {kl_weight: 0.6}}}"
+    preset += "\nsources: {action: {high_level: {utd: 3}}}"
     (tmp_path / "presets" / "tiny.yaml").write_text(preset)
     monkeypatch.setattr(configs.layers, "CONFIG_DIR", tmp_path)
     config = load_config("antmaze", "tiny", {"skills.alpha": "0.7", "skills.horizon": 6}, ["skills.alpha=0.8"])
@@ -51,6 +52,11 @@ def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert config.skills.horizon == 6  # flag over preset
     assert config.skills.alpha == 0.8  # --set over flag
     assert load_config("antsoccer", "tiny").skills.kl_weight == 0.5
+    flat = load_config("antmaze", "tiny", {"method": "explore"}, ["labels.rnd_coefficient=1"])
+    assert flat.labels.offline_reward == "min"  # recipe over family and default
+    assert flat.skills.horizon == 8  # preset over recipe
+    assert (flat.high_level.utd, config.high_level.utd) == (3, 20)  # the preset's section for the recipe's source
+    assert flat.labels.rnd_coefficient == 1.0  # --set over recipe
 
 
 def _written(value: object) -> str:

@@ -1,8 +1,8 @@
 """The configuration: frozen dataclasses, YAML layers over them, and one clear line for every wrong key or value.
 
 Layers, each laid over the one before: the defaults below (the paper's values), ``configs/<family>.yaml``, the method's
-recipe (``qdos_brax.methods``), ``configs/presets/<preset>.yaml`` (with its own ``families:`` section), the command
-line's flags, ``--set key=value``.
+recipe (``qdos_brax.methods``), ``configs/presets/<preset>.yaml`` (with its own sections: ``sources:``, by the recipe's
+source of behaviour, and ``families:``), the command line's flags, ``--set key=value``.
 
 Two kinds of field are told apart by ``metadata["scan"]``. A scannable field is a number that a learner takes as an
 argument of its jitted program: it may hold a list, and every member of the scan gets its own value without a new
@@ -26,9 +26,13 @@ from qdos_brax.config.scan import hyper_tree, members, population_hyper
 from qdos_brax.config.schema import (
     Config,
     DataConfig,
+    DiveOffConfig,
     EvalConfig,
+    GuideConfig,
     HighLevelConfig,
+    HilbertConfig,
     LabelsConfig,
+    PolicyConfig,
     RunConfig,
     SkillsConfig,
     ValuesConfig,
@@ -37,9 +41,13 @@ from qdos_brax.config.schema import (
 __all__ = [
     "Config",
     "DataConfig",
+    "DiveOffConfig",
     "EvalConfig",
+    "GuideConfig",
     "HighLevelConfig",
+    "HilbertConfig",
     "LabelsConfig",
+    "PolicyConfig",
     "RunConfig",
     "SkillsConfig",
     "ValuesConfig",

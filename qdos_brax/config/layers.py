@@ -47,7 +47,7 @@ def load_config(
     values: dict[str, Any] = {}
     values |= _read_layer(CONFIG_DIR / f"{family}.yaml")
     values |= _checked_keys(method_settings(method, family), f"the recipe of {method}")
-    values |= _read_preset(preset, family)
+    values |= _read_preset(preset, family, METHODS[method].source)
     values |= {"env": env, "preset": preset}
     values |= flags
     values |= dict(_parse_set(text) for text in sets)
@@ -107,17 +107,26 @@ def _known_method(name: str) -> str:
     return name
 
 
-def _read_preset(name: str, family: str) -> dict[str, Any]:
+def _read_preset(name: str, family: str, source: str) -> dict[str, Any]:
     if name not in presets():
         raise UserError(f"unknown preset {name!r}{nearest(name, presets())}; there are {', '.join(presets())}")
     path = CONFIG_DIR / "presets" / f"{name}.yaml"
     content = _read_mapping(path)
-    by_family = content.pop("families", None) or {}
-    for key in by_family:
-        if key not in families():
-            raise UserError(f"{path}: unknown family {key!r}{nearest(key, families())}")
+    by_family = _section(content, "families", families(), path)
+    by_source = _section(content, "sources", sorted({recipe.source for recipe in METHODS.values()}), path)
     layer = _checked_keys(_flat(content), str(path))
-    return layer | _checked_keys(_flat(by_family.get(family) or {}), str(path))
+    for own in (by_source.get(source), by_family.get(family)):
+        layer |= _checked_keys(_flat(own or {}), str(path))
+    return layer
+
+
+def _section(content: dict[str, Any], name: str, known: list[str], path: Path) -> dict[str, Any]:
+    """Takes a preset's section out of its content, its names checked."""
+    section = content.pop(name, None) or {}
+    for key in section:
+        if key not in known:
+            raise UserError(f"{path}: {key!r} is none of its {name}{nearest(key, known)}")
+    return section
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:

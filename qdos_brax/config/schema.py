@@ -195,6 +195,112 @@ class HighLevelConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class PolicyConfig:
+    """Flat policies that are learned from the data alone (BC, IQL).
+
+    Attributes:
+        hidden: widths of the policy's hidden layers.
+        batch_size: transitions per gradient step.
+        learning_rate: Adam's.
+        inverse_temperature: (IQL) beta of the weights exp(beta A).
+        updates: gradient steps.
+        every_updates: gradient steps between two evaluations.
+    """
+
+    hidden: tuple[int, ...] = widths(256, 256)
+    batch_size: int = count(256)
+    learning_rate: Scannable = rate(3e-4)
+    inverse_temperature: Scannable = number(10.0)
+    updates: int = count(1_000_000)
+    every_updates: int = count(100_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class GuideConfig:
+    """The diffusion policy that clones the data's behaviour, and how long it guides an episode.
+
+    Attributes:
+        hidden: width of the denoiser's residual blocks.
+        steps: denoising steps.
+        batch_size: transitions per gradient step.
+        learning_rate: Adam's.
+        average_rate: rate at which the average of the parameters, which is what acts, follows them.
+        updates: gradient steps.
+        ratio: share of the episodes that begin with the guide.
+        persistence: probability that the guide goes on after a step.
+    """
+
+    hidden: int = count(256)
+    steps: int = count(5)
+    batch_size: int = count(256)
+    learning_rate: Scannable = rate(3e-4)
+    average_rate: Scannable = number(0.001, high=1.0, above=True)
+    updates: int = count(3_000_000)
+    ratio: float = number(0.9, high=1.0, scan=False)
+    persistence: float = number(0.99, high=0.9999, scan=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class HilbertConfig:
+    """The Hilbert representation of states and the policy that follows its directions (HILP, Park et al. 2024).
+
+    Attributes:
+        hidden: widths of the hidden layers of all its networks.
+        batch_size: transitions per gradient step.
+        learning_rate: Adam's, of all networks.
+        expectile: of the distance's regression.
+        skill_expectile: of the directions' values.
+        discount: per environment step.
+        target_rate: Polyak rate of the targets.
+        inverse_temperature: beta of the directional policy's weights exp(beta A).
+        random_goals: share of goals that are any state; the others lie ahead in the same episode.
+        updates: gradient steps.
+    """
+
+    hidden: tuple[int, ...] = widths(512, 512, 512)
+    batch_size: int = count(1024)
+    learning_rate: Scannable = rate(3e-4)
+    expectile: Scannable = number(0.95, high=1.0, above=True)
+    skill_expectile: Scannable = number(0.9, high=1.0, above=True)
+    discount: Scannable = number(0.99, above=True, high=0.9999)
+    target_rate: Scannable = number(0.005, high=1.0, above=True)
+    inverse_temperature: Scannable = number(10.0)
+    random_goals: float = number(0.375, high=1.0, scan=False)
+    updates: int = count(1_000_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class DiveOffConfig:
+    """Quality and diversity on single transitions (DiveOff, Osa and Harada 2024).
+
+    Attributes:
+        hidden: widths of the hidden layers of all its networks.
+        batch_size: transitions per gradient step.
+        learning_rate: Adam's, of actor and critic.
+        autoencoder_rate: of the step on autoencoder and information, as a share of it.
+        discount: per environment step.
+        target_rate: Polyak rate of the targets.
+        scale: of the advantage in the weights exp(scale A).
+        kl_weight: of the posterior's divergence, against a mean squared error of reconstruction.
+        information: weight of the information term.
+        autoencoder_updates: first gradient steps, without weights and without that term.
+        updates: gradient steps.
+    """
+
+    hidden: tuple[int, ...] = widths(256, 256)
+    batch_size: int = count(256)
+    learning_rate: Scannable = rate(3e-4)
+    autoencoder_rate: Scannable = number(0.3)
+    discount: Scannable = number(0.99, high=1.0)
+    target_rate: Scannable = number(0.005, high=1.0, above=True)
+    scale: Scannable = number(3.0)
+    kl_weight: Scannable = number(50.0)
+    information: Scannable = number(2.0)
+    autoencoder_updates: int = count(10_000, low=0)
+    updates: int = count(1_000_000)
+
+
+@dataclasses.dataclass(frozen=True)
 class EvalConfig:
     """Evaluation on environments of its own.
 
@@ -237,6 +343,10 @@ class Config:
         skills: trajectory VAE.
         labels: pseudo-labels.
         high_level: online learner.
+        policy: flat offline policies.
+        guide: guide of the first steps online.
+        hilbert: Hilbert representation.
+        diveoff: DiveOff.
         eval: evaluation.
         run: writing.
     """
@@ -253,6 +363,10 @@ class Config:
     skills: SkillsConfig = SkillsConfig()
     labels: LabelsConfig = LabelsConfig()
     high_level: HighLevelConfig = HighLevelConfig()
+    policy: PolicyConfig = PolicyConfig()
+    guide: GuideConfig = GuideConfig()
+    hilbert: HilbertConfig = HilbertConfig()
+    diveoff: DiveOffConfig = DiveOffConfig()
     eval: EvalConfig = EvalConfig()
     run: RunConfig = RunConfig()
 

@@ -19,7 +19,7 @@ from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
-from qdos_brax.high_level.sac import SAC, Batch, SACHyper, SACState
+from qdos_brax.high_level.sac import SAC, Batch, Reference, SACHyper, SACState
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
 from qdos_brax.population import over_members
@@ -273,17 +273,13 @@ class OnlinePhase:
         active = env_steps >= self._config.labels.start_env_steps
         learners = self._learn_labels(learners, online, hyper, active)
 
+        target_entropy, reference = self._regulariser(frozen["skills"], hyper)
         sac_hyper = SACHyper(
             learning_rate=hyper["high_level.learning_rate"],
             discount=hyper["high_level.discount"],
             target_rate=hyper["high_level.target_rate"],
-            target_entropy=-hyper["high_level.target_entropy_scale"] * self._sac.action_dim,
+            target_entropy=target_entropy,
         )
-        reference = None
-        if high.regulariser == "prior":
-            sac_hyper = sac_hyper.replace(target_entropy=-hyper["high_level.target_divergence"])
-            box = hyper["skills.latent_box"]
-            reference = lambda obs, action: self._source.log_prior(frozen["skills"], action, obs, box)  # noqa: E731
         sample = partial(self._sample, learners, replay, frozen=frozen, hyper=hyper, data=data)
 
         def critic_step(sac: SACState, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
@@ -296,6 +292,16 @@ class OnlinePhase:
         bonus = self._novelty.of(learners.rnd, online.observation, online.action, hyper)
         info = jax.tree.map(jnp.mean, critic_info) | actor_info | {"bonus": jnp.mean(bonus)}
         return learners.replace(sac=sac), info
+
+    def _regulariser(self, skills: Any, hyper: dict[str, jax.Array]) -> tuple[jax.Array, Reference | None]:
+        """The entropy that the temperature aims at, and what density it is relative to."""
+        if self._config.high_level.regulariser == "entropy":
+            return -hyper["high_level.target_entropy_scale"] * self._sac.action_dim, None
+
+        def log_prior(observation: jax.Array, action: jax.Array) -> jax.Array:
+            return self._source.log_prior(skills, action, observation, hyper["skills.latent_box"])
+
+        return -hyper["high_level.target_divergence"], log_prior
 
     def _learn_labels(
         self, learners: Learners, online: OnlineRow, hyper: dict[str, jax.Array], active: jax.Array

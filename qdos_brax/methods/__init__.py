@@ -18,9 +18,12 @@ class Recipe:
 
     Attributes:
         summary: one line for a list of methods.
-        source: of low-level behaviour: "trajectory" (a VAE of segments) or "action" (none: the policy acts itself).
+        source: of low-level behaviour: "trajectory" (a VAE of segments), "transition" (a VAE of single transitions),
+            "direction" (in a Hilbert representation) or "action" (none: the policy acts itself).
         weighted: segments are weighted by their advantage (else all count the same, and no values are learned).
         information: the mutual-information term is on.
+        guide: what acts for the first steps of an episode online: "diffusion", or None.
+        policy: the flat policy that is learned from the data alone, "bc" or "iql", and then nothing is learned online.
         settings: published values by dotted key.
         by_family: the same, for single task families.
     """
@@ -29,6 +32,8 @@ class Recipe:
     source: str = "trajectory"
     weighted: bool = False
     information: bool = False
+    guide: str | None = None
+    policy: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     by_family: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -40,11 +45,21 @@ _MANIPULATION = ("cube", "kitchen", "scene")
 _UNLABELLED = {"labels.offline_reward": "min"}
 _UNLABELLED_BY_FAMILY = {family: {"labels.offline_reward": "pred"} for family in _MANIPULATION}
 
+# The dimension that HILP was published with on mazes and kitchen.
+_DIRECTIONS = {"skills.latent_dim": 32}
+
 # Nothing of the data but the skills.
 _ONLINE_ONLY = {"high_level.offline_fraction": 0.0, "labels.bonus_rows": "online"}
 
 # One action per decision, one step per segment.
-_FLAT = {"skills.horizon": 1, "values.n_step": 1}
+_FLAT = {"skills.horizon": 1}
+
+# Widths of the published offline policies: 2 x 256 on D4RL's tasks (Kostrikov et al. 2022), 3 x 512 on OGBench's
+# (Park et al. 2025).
+_OFFLINE_WIDTHS = {
+    family: {"policy.hidden": [512, 512, 512], "values.hidden": [512, 512, 512]}
+    for family in ("antsoccer", "cube", "humanoidmaze", "scene")
+}
 
 METHODS = {
     "qdos": Recipe("advantage-weighted, diverse skills; rewards of the data", weighted=True, information=True),
@@ -75,6 +90,50 @@ METHODS = {
         "no skills; SAC with an ensemble, half of each batch from the data (RLPD, Ball et al. 2023)",
         source="action",
         settings=_FLAT | {"labels.rnd_coefficient": 0.0},
+    ),
+    # Park et al. 2024, "Foundation policies with Hilbert representations"; online as in Wilcoxson et al. 2025.
+    "hilp": Recipe(
+        "directions in a Hilbert representation as skills, online as SUPE (HILP, Park et al. 2024)",
+        source="direction",
+        settings=_UNLABELLED | _DIRECTIONS,
+        by_family=_UNLABELLED_BY_FAMILY,
+    ),
+    "hilp-online": Recipe(
+        "HILP's skills, learned with online alone",
+        source="direction",
+        settings=_ONLINE_ONLY | _DIRECTIONS,
+    ),
+    # Uchendu et al. 2022, "Jump-start reinforcement learning", with the diffusion policy, the schedule and the numbers
+    # of Wilcoxson et al. 2025 (published commands): online ExPLORe without the data.
+    "diffusion-jsrl": Recipe(
+        "no skills; a diffusion clone of the data acts for an episode's first steps (JSRL, Uchendu et al. 2022)",
+        source="action",
+        guide="diffusion",
+        settings=_FLAT | _ONLINE_ONLY | {"labels.rnd_coefficient": 2.0, "high_level.init_temperature": 1.0},
+        by_family={family: {"guide.ratio": 0.75} for family in _MANIPULATION},
+    ),
+    # Kostrikov et al. 2022, "Offline reinforcement learning with implicit Q-learning": expectile 0.9 and beta 10 in
+    # mazes, 0.7 and 0.5 in the kitchen; Park et al. 2025 (OGBench): 0.9 and 10.
+    "iql": Recipe(
+        "no skills, offline alone: implicit Q-learning (Kostrikov et al. 2022)",
+        source="action",
+        policy="iql",
+        settings=_FLAT | {"values.estimator": "iql", "values.expectile": 0.9, "policy.inverse_temperature": 10.0},
+        by_family=_OFFLINE_WIDTHS | {"kitchen": {"values.expectile": 0.7, "policy.inverse_temperature": 0.5}},
+    ),
+    "bc": Recipe(
+        "no skills, offline alone: behaviour cloning",
+        source="action",
+        policy="bc",
+        settings=_FLAT,
+        by_family=_OFFLINE_WIDTHS,
+    ),
+    # Osa and Harada 2024, "Discovering multiple solutions from a single task in offline reinforcement learning": z of
+    # dimension 2 from [-2, 2], which the high level draws on as the paper does on its own skills.
+    "diveoff": Recipe(
+        "latents of single transitions, good and diverse, as skills (DiveOff, Osa and Harada 2024)",
+        source="transition",
+        settings={"skills.latent_dim": 2, "skills.latent_box": 2.0, "high_level.latent_map": "box"},
     ),
 }
 

@@ -18,6 +18,7 @@ from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.errors import UserError
 from qdos_brax.high_level.agent import Agent, Player
 from qdos_brax.high_level.evaluation import evaluate
+from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.online_phase import OnlinePhase, high_level_sac
 from qdos_brax.labels.bonus import Bonus, NoBonus, RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
@@ -25,6 +26,14 @@ from qdos_brax.labels.offline_reward import DataReward, MinimumReward, OfflineRe
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
 from qdos_brax.methods import METHODS, Recipe
+from qdos_brax.offline.bc import BC
+from qdos_brax.offline.diffusion import DiffusionBC
+from qdos_brax.offline.diveoff import DiveOff
+from qdos_brax.offline.hilbert import Hilbert
+from qdos_brax.offline.iql_policy import IQLPolicy
+from qdos_brax.offline.learner import Learner, PolicyLearner
+from qdos_brax.offline.offline_phase import Evaluation, OfflinePhase
+from qdos_brax.offline.player import FlatPlayer
 from qdos_brax.population import over_members
 from qdos_brax.runs.checkpoint import final_artifacts
 from qdos_brax.runs.folder import RunFolder
@@ -33,7 +42,7 @@ from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, SegmentWeights, UniformWeights
 from qdos_brax.skills.skill_phase import Information, SkillPhase
-from qdos_brax.skills.source import ActionSource, SkillSource, TrajectorySource
+from qdos_brax.skills.source import ActionSource, DirectionSource, SkillSource, TrajectorySource, TransitionSource
 from qdos_brax.skills.vae import SkillModel
 from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
@@ -53,9 +62,13 @@ def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
     task = _task(config, env, dataset)
     high = config.high_level
     source = make_source(config, env)
+    if task.recipe.policy is not None:
+        return [_policy_phase(task, task.recipe.policy)]
     labelled = round(high.batch_size * high.offline_fraction) > 0
+    guide = None if task.recipe.guide is None else _GUIDES[task.recipe.guide](config, env)
     return [
         *_SOURCES[task.recipe.source].phases(task),
+        *([] if guide is None else [_offline_phase(task, "guide", guide.learner, config.guide.updates)]),
         *([LabelPhase(config, task.data, task.hyper, source)] if labelled else []),
         OnlinePhase(
             config,
@@ -66,6 +79,7 @@ def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
             source,
             _labeller(config, env, source),
             _bonus(config, env, source),
+            None if guide is None else guide.jump_start,
         ),
     ]
 
@@ -123,6 +137,48 @@ def _trajectory_phases(task: _Task) -> list[Phase]:
     ]
 
 
+def _hilbert(config: Config, env: Any) -> Hilbert:
+    own = config.hilbert
+    return Hilbert(
+        env.observation_size,
+        env.action_size,
+        config.skills.latent_dim,
+        own.hidden,
+        own.batch_size,
+        own.random_goals,
+    )
+
+
+def _direction_source(config: Config, env: Any) -> SkillSource:
+    learner = _hilbert(config, env)
+    return DirectionSource(learner.latent_dim, learner.direction, learner.act)
+
+
+def _direction_phases(task: _Task) -> list[Phase]:
+    return [_offline_phase(task, "skills", _hilbert(task.config, task.env), task.config.hilbert.updates)]
+
+
+def _diveoff(config: Config, env: Any) -> DiveOff:
+    own = config.diveoff
+    return DiveOff(
+        env.observation_size,
+        env.action_size,
+        config.skills.latent_dim,
+        own.hidden,
+        own.batch_size,
+        own.autoencoder_updates,
+    )
+
+
+def _transition_source(config: Config, env: Any) -> SkillSource:
+    learner = _diveoff(config, env)
+    return TransitionSource(learner, learner.encode, config.high_level.latent_map)
+
+
+def _transition_phases(task: _Task) -> list[Phase]:
+    return [_offline_phase(task, "skills", _diveoff(task.config, task.env), task.config.diveoff.updates)]
+
+
 def _action_source(config: Config, env: Any) -> SkillSource:
     if config.skills.horizon != 1:
         raise UserError(
@@ -134,8 +190,57 @@ def _action_source(config: Config, env: Any) -> SkillSource:
 
 _SOURCES = {
     "trajectory": _Source(_trajectory_source, _trajectory_phases),
+    "transition": _Source(_transition_source, _transition_phases),
+    "direction": _Source(_direction_source, _direction_phases),
     "action": _Source(_action_source, lambda task: []),
 }
+
+
+def _offline_phase(
+    task: _Task, name: str, learner: Learner, updates: int, evaluation: Evaluation | None = None
+) -> OfflinePhase:
+    return OfflinePhase(name, learner, task.data, task.normaliser, task.hyper, updates, evaluation)
+
+
+class _Guide(NamedTuple):
+    """What acts for the first steps of an episode online: how it is learned, and how it is called."""
+
+    learner: Learner
+    jump_start: JumpStart
+
+
+def _diffusion_guide(config: Config, env: Any) -> _Guide:
+    own = config.guide
+    learner = DiffusionBC(env.observation_size, env.action_size, own.hidden, own.steps, own.batch_size)
+    return _Guide(learner, JumpStart(learner.sample, own.ratio, own.persistence))
+
+
+_GUIDES = {"diffusion": _diffusion_guide}
+
+
+def _bc(config: Config, env: Any) -> PolicyLearner:
+    return BC(env.observation_size, env.action_size, config.policy.hidden, config.policy.batch_size)
+
+
+def _iql(config: Config, env: Any) -> PolicyLearner:
+    values = IQL(env.observation_size, env.action_size, config.values.hidden)
+    return IQLPolicy(env.observation_size, env.action_size, config.policy.hidden, values, config.policy.batch_size)
+
+
+_POLICIES = {"bc": _bc, "iql": _iql}
+
+
+def _policy_phase(task: _Task, name: str) -> OfflinePhase:
+    """The one phase of a policy that is learned from the data alone, with its learning curve."""
+    config, learner = task.config, _POLICIES[name](task.config, task.env)
+    evaluation = Evaluation(
+        task.env,
+        lambda params: FlatPlayer(task.normaliser, learner.act, params),
+        config.eval.episodes,
+        config.skills.horizon,
+        config.policy.every_updates,
+    )
+    return _offline_phase(task, "policy", learner, config.policy.updates, evaluation)
 
 
 def value_phase(
@@ -179,25 +284,29 @@ def load_run(run: Path) -> TrainedRun:
     if folder.read_summary() is None:
         raise UserError(f"the run in {run} has not ended; go on with: python train.py --resume {run}")
     env = envs.make(config.env, physics=config.physics)
-    source = make_source(config, env)
-    sac = high_level_sac(config, env.observation_size, source)
-
-    def agent(artifacts: Any, hyper: Any) -> Player:
-        return Agent(
-            normaliser=Normaliser(**artifacts["normaliser"]),
-            source=source,
-            sac=sac,
-            box=hyper["skills.latent_box"],
-            skills=artifacts.get("skills", {}),
-            actor=artifacts["actor"],
-        )
-
     return TrainedRun(
         config,
         env,
         final_artifacts(folder.checkpoints, configs.config_hash(config)),
         {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()},
-        agent,
+        _player(config, env),
+    )
+
+
+def _player(config: Config, env: Any) -> Callable[[Any, Any], Player]:
+    """(artifacts, hyper) of one member -> what plays."""
+    source, policy = make_source(config, env), METHODS[config.method].policy
+    if policy is not None:
+        act = _POLICIES[policy](config, env).act
+        return lambda artifacts, hyper: FlatPlayer(Normaliser(**artifacts["normaliser"]), act, artifacts["policy"])
+    sac = high_level_sac(config, env.observation_size, source)
+    return lambda artifacts, hyper: Agent(
+        normaliser=Normaliser(**artifacts["normaliser"]),
+        source=source,
+        sac=sac,
+        box=hyper["skills.latent_box"],
+        skills=artifacts.get("skills", {}),
+        actor=artifacts["actor"],
     )
 
 

@@ -183,10 +183,10 @@ class DiffusionBC:
     def update(
         self, state: DiffusionState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]
     ) -> tuple[DiffusionState, dict[str, jax.Array]]:
-        """One gradient step on a batch of the data; reads ``diffusion.learning_rate`` and ``.average_rate``."""
+        """One gradient step on a batch of the data; reads ``guide.learning_rate`` and ``.average_rate``."""
         rows_key, loss_key = jax.random.split(key)
         rows = random_rows(data, rows_key, self.batch_size)
-        own = DiffusionHyper(hyper["diffusion.learning_rate"], hyper["diffusion.average_rate"])
+        own = DiffusionHyper(hyper["guide.learning_rate"], hyper["guide.average_rate"])
         return self.step(state, data.observations[rows], data.actions[rows], loss_key, own)
 
     def params(self, state: DiffusionState) -> dict[str, Any]:

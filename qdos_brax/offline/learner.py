@@ -35,3 +35,11 @@ class Learner(Protocol):
     def params(self, state: Any) -> dict[str, Any]:
         """What the phases after and the evaluation need: nested dicts with text keys."""
         ...
+
+
+class PolicyLearner(Learner, Protocol):
+    """A learner of a policy that decides at every step."""
+
+    def act(self, params: dict[str, Any], observation: jax.Array) -> jax.Array:
+        """The policy's mode, [..., act] in [-1, 1], at normalised observations[..., obs]."""
+        ...

@@ -6,6 +6,7 @@ z a segment of the data played. ``params`` is always what the source's own learn
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -50,7 +51,7 @@ class SkillSource(Protocol):
         ...
 
     def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """Log density[...] of ``first`` at u."""
+        """Log density[...] at u of what the actor may be held near: the skill prior, or uniform where there is none."""
         ...
 
     def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
@@ -58,21 +59,31 @@ class SkillSource(Protocol):
         ...
 
 
-class TrajectorySource:
-    """The trajectory VAE: z says what a whole segment does.
+class LatentModel(Protocol):
+    """Prior and decoder of a latent-variable model of behaviour."""
+
+    latent_dim: int
+
+    def prior(self, params: Any, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """p(z | s): (mean[..., z], log standard deviation[..., z])."""
+        ...
+
+    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """The action[..., act] of z, in [-1, 1]."""
+        ...
+
+
+class LatentSource:
+    """A latent-variable model with a state prior, all but its posterior.
 
     Args:
-        model: posterior, prior and decoder.
+        model: the model.
         map_name: of the map between u and z ("arctanh", "box" or "prior").
     """
 
-    def __init__(self, model: SkillModel, map_name: str) -> None:
+    def __init__(self, model: LatentModel, map_name: str) -> None:
         self.width = model.latent_dim
         self._model, self._map_name = model, map_name
-
-    def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
-        """The encoder's."""
-        return self._model.encode(params, segments)
 
     def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
         """By the map."""
@@ -100,6 +111,93 @@ class TrajectorySource:
 
     def _prior(self, params: Any, observation: jax.Array) -> Prior:
         return Prior(*self._model.prior(params, observation))
+
+
+class TrajectorySource(LatentSource):
+    """The trajectory VAE: z says what a whole segment does.
+
+    Args:
+        model: posterior, prior and decoder.
+        map_name: of the map between u and z.
+    """
+
+    def __init__(self, model: SkillModel, map_name: str) -> None:
+        super().__init__(model, map_name)
+        self._encode = model.encode
+
+    def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
+        """The encoder's."""
+        return self._encode(params, segments)
+
+
+class TransitionSource(LatentSource):
+    """A latent that is read off single transitions (DiveOff): a segment's is the mean over its own.
+
+    Args:
+        model: prior and decoder.
+        encode: (parameters, observation, action) -> (mean, log standard deviation) of the transition's latent.
+        map_name: of the map between u and z.
+    """
+
+    def __init__(
+        self,
+        model: LatentModel,
+        encode: Callable[[Any, jax.Array, jax.Array], tuple[jax.Array, jax.Array]],
+        map_name: str,
+    ) -> None:
+        super().__init__(model, map_name)
+        self._encode = encode
+
+    def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
+        """That of the mean of independent latents."""
+        mean, log_std = self._encode(params, *segments)
+        variance = jnp.mean(jnp.exp(2 * log_std), axis=1) / log_std.shape[1]
+        return Posterior(jnp.mean(mean, axis=1), 0.5 * jnp.log(variance))
+
+
+class DirectionSource:
+    """Directions of travel in a representation of states: z is a unit vector, and so is every u's (HILP).
+
+    Args:
+        width: of the representation.
+        direction: (parameters, observation from, observation to) -> unit vector[..., width].
+        act: (parameters, observation, z) -> action.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        direction: Callable[[Any, jax.Array, jax.Array], jax.Array],
+        act: Callable[[Any, jax.Array, jax.Array], jax.Array],
+    ) -> None:
+        self.width = width
+        self._direction, self._act = direction, act
+
+    def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
+        """The direction from the segment's first state to the one behind its last."""
+        latent = self._direction(params, segments.observations[:, 0], after)
+        return Posterior(latent, jnp.full_like(latent, -jnp.inf))
+
+    def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """z = u / ||u||."""
+        return unit(action)
+
+    def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """u = z: of all that point there, the one that a unit vector is."""
+        return jnp.clip(latent, -1 + MARGIN, 1 - MARGIN)
+
+    def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """Uniform over the directions."""
+        latent = unit(jax.random.normal(key, (*observation.shape[:-1], self.width)))
+        return self.to_action(params, latent, observation, box)
+
+    def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
+        """That of the uniform distribution over u."""
+        return jnp.full(action.shape[:-1], -self.width * jnp.log(2.0))
+
+    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """The directional policy's."""
+        return self._act(params, observation, latent)
 
 
 class ActionSource:
@@ -136,3 +234,8 @@ class ActionSource:
     def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
         """z itself."""
         return latent
+
+
+def unit(vector: jax.Array) -> jax.Array:
+    """The vector[..., d] over its length, which is taken as at least 1e-6."""
+    return vector / jnp.maximum(jnp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6)

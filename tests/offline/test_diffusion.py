@@ -65,7 +65,7 @@ def test_both_modes_keep_their_shares_which_a_gaussian_cannot():
     observation, action = two_modes()
     data = device_data(observation, action)
     learner = DiffusionBC(1, 2, hidden=32, steps=10, batch_size=256, blocks=2, dropout=0.0)
-    state, _ = train(learner, data, {"diffusion.learning_rate": 2e-3, "diffusion.average_rate": 0.01}, 2000)
+    state, _ = train(learner, data, {"guide.learning_rate": 2e-3, "guide.average_rate": 0.01}, 2000)
     gaussian = BC(1, 2, (32,), batch_size=256)
     cloned, _ = train(gaussian, data, {"policy.learning_rate": 3e-3}, 500)
 

@@ -1,0 +1,34 @@
+"""What plays a flat policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+
+from qdos_brax.data.device import Normaliser
+
+
+@dataclass(frozen=True)
+class FlatPlayer:
+    """A policy that decides at every step (``qdos_brax.high_level.agent.Player`` with H = 1): a decision is an action.
+
+    Attributes:
+        normaliser: of observations.
+        act: (parameters, normalised observation) -> action.
+        params: parameters of the policy.
+    """
+
+    normaliser: Normaliser
+    act: Callable[[Any, jax.Array], jax.Array]
+    params: Any
+
+    def choose(self, observation: jax.Array) -> jax.Array:
+        """The action[..., act] at observation[..., obs]."""
+        return self.act(self.params, self.normaliser(observation))
+
+    def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """The decision itself."""
+        return latent
