@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from sklearn.manifold import TSNE  # type: ignore[import-untyped]
+from threadpoolctl import threadpool_limits
 
 import envs
 from envs.render import NoOpenGL, Renderer
@@ -168,8 +169,7 @@ class _LatentView:
         latents = np.asarray(self._posterior(artifacts["skills"], self._segments, self._after).mean)
         found: Arrays = {"latent": latents}
         if len(latents) > _GRID:
-            perplexity = min(30.0, (len(latents) - 1) / 3)
-            found["tsne"] = TSNE(perplexity=perplexity, init="pca", random_state=_SEED).fit_transform(latents)
+            found["tsne"] = _tsne(latents)
         grid, between = _grid(latents), _between(latents)
         paths = np.asarray(self._play(artifacts, hyper, np.concatenate([grid, between])), np.float32)
         return found | {"grid": paths[: len(grid)], "between": paths[len(grid) :]}
@@ -185,6 +185,13 @@ class _LatentView:
         start = env.reset(evaluation_key())
         _, path = jax.lax.scan(step, start, None, self._steps)
         return jnp.concatenate([start.pipeline_state.qpos[None, :2], path])
+
+
+def _tsne(latents: np.ndarray) -> np.ndarray:
+    """float32[n, 2], for the eye."""
+    perplexity = min(30.0, (len(latents) - 1) / 3)
+    with threadpool_limits(1):  # its threads wait for each other at every step, for ever where cores are scarce
+        return np.asarray(TSNE(perplexity=perplexity, init="pca", random_state=_SEED).fit_transform(latents))
 
 
 def _main_directions(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
