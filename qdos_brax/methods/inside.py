@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from sklearn.manifold import TSNE  # type: ignore[import-untyped]
-from threadpoolctl import threadpool_limits
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 import envs
 from envs.render import NoOpenGL, Renderer

@@ -54,11 +54,11 @@ def _looks(study: Study, run: Run) -> Iterator[Look]:
     try:
         with np.load(file, allow_pickle=False) as content:
             arrays = {name: content[name] for name in content.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        members = {int(index): run.members[int(index)] for index in arrays["members"]}
+    except (OSError, EOFError, LookupError, ValueError, zipfile.BadZipFile) as error:
         raise UserError(f"cannot read {file} ({error}); remove it, and --resume {run.path} makes it again") from error
     shared = {name: array for name, array in arrays.items() if "/" not in name}
-    for index in arrays["members"]:
-        member = run.members[int(index)]
+    for index, member in members.items():
         own = {name.partition("/")[2]: array for name, array in arrays.items() if name.startswith(f"{index}/")}
         label = next(s.label for s in study.settings if member in s.members.get(member.task, []))
         several = len(study.tasks) > 1
