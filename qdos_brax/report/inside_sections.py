@@ -92,7 +92,7 @@ def _latents(looks: list[Look]) -> Section:
             buttons = [
                 {"label": name, "method": "restyle", "args": [{"marker": [marker]}]} for name, marker in markers.items()
             ]
-            place = {"type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.16}
+            place = {"type": "buttons", "active": 0, "direction": "right", "x": 0, "xanchor": "left", "y": 1.16}
             layout["updatemenus"] = [{"buttons": buttons, **place}]
             for axis in ("xaxis", "yaxis"):
                 layout[axis] |= {"showticklabels": False, "zeroline": False}
