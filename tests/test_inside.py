@@ -115,6 +115,7 @@ def opengl_or_not() -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_without_provenance_it_is_one_line(finished: Path) -> None:
     with pytest.raises(UserError, match="which data the run had"):
         inside.look_inside(finished)
