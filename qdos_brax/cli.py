@@ -54,15 +54,21 @@ def train_parser() -> Parser:
     )
     parser.add_argument("--seed", metavar="S[,S..]", help="seed; several make a scan (default 0)")
     methods = "; ".join(f"{name}: {recipe.summary}" for name, recipe in METHODS.items())
-    parser.add_argument("--method", metavar="NAME", help=f"the method (default qdos). {methods}")
+    parser.add_argument(
+        "--method",
+        metavar="NAME[,NAME..]",
+        help=f"the method (default qdos); several are compared, one run after another. {methods}",
+    )
     parser.add_argument(
         "--preset",
         metavar="NAME",
         help=f"sizes of networks and budgets: {', '.join(presets())} (default cpu without an accelerator, else paper)",
     )
-    parser.add_argument("--out", metavar="DIR", help="the run folder (default: a new one under runs/)")
+    parser.add_argument("--out", metavar="DIR", help="the folder of the run or comparison (default: under runs/)")
     parser.add_argument(
-        "--resume", metavar="DIR", help="go on with the run in DIR, exactly where it was; takes no other flag"
+        "--resume",
+        metavar="DIR",
+        help="go on with the run or comparison in DIR, exactly where it was; takes no other flag",
     )
     parser.add_argument(
         "--dataset",
@@ -107,8 +113,8 @@ def _flags(parser: argparse.ArgumentParser) -> list[str]:
     return flags
 
 
-def config_from_args(args: argparse.Namespace) -> Config:
-    """The configuration that the flags of ``train.py`` ask for.
+def configs_from_args(args: argparse.Namespace) -> list[Config]:
+    """The configurations that the flags of ``train.py`` ask for: one per method.
 
     Raises:
         UserError: a value is wrong.
@@ -116,7 +122,6 @@ def config_from_args(args: argparse.Namespace) -> Config:
     by_key = {
         "skills.alpha": args.alpha,
         "seed": args.seed,
-        "method": args.method,
         "out": args.out,
         "dataset": args.dataset,
         "physics": args.physics,
@@ -129,7 +134,13 @@ def config_from_args(args: argparse.Namespace) -> Config:
         "diveoff.updates": args.pretrain_steps,
     }
     flags = {key: value for key, value in by_key.items() if value is not None}
-    return load_config(args.env, args.preset, flags, args.set)
+    if args.method is None:
+        return [load_config(args.env, args.preset, flags, args.set)]
+    methods = [name.strip() for name in args.method.split(",")]
+    for name in methods:
+        if methods.count(name) > 1:
+            raise UserError(f"--method holds {name!r} twice: {args.method}")
+    return [load_config(args.env, args.preset, {**flags, "method": name}, args.set) for name in methods]
 
 
 def _train(args: argparse.Namespace, started: float) -> int:
@@ -142,7 +153,7 @@ def _train(args: argparse.Namespace, started: float) -> int:
     from qdos_brax import train_flow  # here, so that --help and a wrong flag answer at once
 
     if args.resume is None:
-        train_flow.start(lambda: config_from_args(args), preset_given=args.preset is not None, started=started)
+        train_flow.start(lambda: configs_from_args(args), preset_given=args.preset is not None, started=started)
     else:
         train_flow.resume(args.resume, started=started)
     return 0
@@ -170,10 +181,13 @@ def main_parser(argv: Sequence[str]) -> Parser:
     )
     evaluate.set_defaults(run=_evaluate)
 
-    report = commands.add_parser("report", help="draw the learning curves of runs")
-    report.add_argument("runs", metavar="RUN", nargs="+", help="a run folder")
+    report = commands.add_parser("report", help="tables, learning curves and a page of runs")
+    report.add_argument("runs", metavar="RUN", nargs="+", help="a run's or comparison's folder; all must have ended")
     report.add_argument(
-        "--out", metavar="FILE", help="the picture (default: curves.png, in the folder of a single run)"
+        "--out", metavar="DIR", help="where the files go (default: the folder of a single RUN, else report/)"
+    )
+    report.add_argument(
+        "--reference", metavar="METHOD", help="what the others are compared with (default supe, else the first)"
     )
     report.set_defaults(run=_report)
 
@@ -210,12 +224,14 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace) -> int:
-    from qdos_brax.report.curves import draw_curves
+    from qdos_brax.report.write import write_report
 
     runs = [Path(run) for run in args.runs]
-    out = Path(args.out) if args.out else (runs[0] if len(runs) == 1 else Path()) / "curves.png"
-    draw_curves(runs, out)
-    print(out)
+    out = Path(args.out) if args.out else runs[0] if len(runs) == 1 else Path("report")
+    report = write_report(runs, out, args.reference)
+    print(f"{report.text}\n")
+    for file in report.files:
+        print(file)
     return 0
 
 

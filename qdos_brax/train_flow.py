@@ -1,4 +1,4 @@
-"""One run from flags to report: configuration, task, data, phases, curves. What each part does is elsewhere."""
+"""A run or a comparison from flags to report: configuration, task, data, phases. What each part does is elsewhere."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,10 @@ from qdos_brax import config as configs
 from qdos_brax.config import Config
 from qdos_brax.data import cache, download, formats
 from qdos_brax.errors import UserError
+from qdos_brax.methods import METHODS
 from qdos_brax.methods.build import build_phases
-from qdos_brax.report.curves import draw_curves
-from qdos_brax.runs import compile_cache
+from qdos_brax.report.write import Report, write_report
+from qdos_brax.runs import comparison, compile_cache
 from qdos_brax.runs.folder import RunFolder, new_path, write_text
 from qdos_brax.runs.loop import run_phases
 
@@ -37,59 +38,98 @@ def prepare_jax() -> None:
     compile_cache.enable()
 
 
-def start(make_config: Callable[[], Config], preset_given: bool, started: float) -> dict[str, Any]:
-    """A new run to its end.
+def start(make_configs: Callable[[], Sequence[Config]], preset_given: bool, started: float) -> None:
+    """A new run to its end; of several configurations a comparison, one run after another.
 
     Args:
-        make_config: reads the configuration; called once jax may be asked for its devices.
+        make_configs: reads the configurations, which differ in their method; called once jax may be asked for its
+            devices.
         preset_given: whether the user named the preset; if not, the first lines say why it was taken.
         started: ``time.perf_counter()`` at the process's start.
-
-    Returns:
-        The summary.
 
     Raises:
         UserError: a flag, a file or the disk is at fault.
     """
     prepare_jax()
-    asked = make_config()
-    if asked.dataset:
-        download.check(asked.dataset)
-    env = _make_env(asked)
-    resolved = configs.replace(asked, env=env.spec.full_name, physics=env.backend)
-    folder = RunFolder.create(asked.out or new_path(asked.run.root, f"{resolved.env}-{resolved.method}"))
-    resolved = configs.replace(resolved, out=str(folder.path))
-    with folder.held():
-        folder.provenance.unlink(missing_ok=True)  # of an attempt in the same folder that ended before training
-        write_text(folder.config, configs.to_yaml(resolved))
-        _announce(resolved, asked, chosen=not preset_given)
-        return _run(resolved, env, folder, started)
+    asked = make_configs()
+    first = asked[0]
+    if first.dataset:
+        download.check(first.dataset)
+    env = _make_env(first)
+    if len(asked) == 1:
+        resolved = _resolved(first, env, Path(first.out or _new_path(first, env, first.method)))
+        folder = RunFolder.create(str(resolved.out))
+        with folder.held():
+            folder.provenance.unlink(missing_ok=True)  # of an attempt in the same folder that ended before training
+            write_text(folder.config, configs.to_yaml(resolved))
+            _announce(resolved, first, chosen=not preset_given)
+            _run(resolved, env, folder, started)
+        return
+    path = Path(first.out or _new_path(first, env, "comparison"))
+    members = {config.method: _resolved(config, env, path / config.method) for config in asked}
+    comparison.create(path, {method: configs.to_yaml(config) for method, config in members.items()})
+    _compare(path, started, chosen=not preset_given)
 
 
-def resume(path: str, started: float) -> dict[str, Any]:
-    """Goes on with the run in ``path`` to its end.
-
-    Returns:
-        The summary.
+def resume(path: str, started: float) -> None:
+    """Goes on with the run or the comparison in ``path`` to its end.
 
     Raises:
-        UserError: there is no run, another process works on it, or it cannot go on.
+        UserError: there is none, another process works on it, or it cannot go on.
     """
     prepare_jax()
-    folder = RunFolder.open(path)
+    if comparison.is_comparison(path):
+        _compare(Path(path), started, chosen=False)
+    else:
+        _go_on(RunFolder.open(path), started, chosen=False)
+
+
+def _compare(path: Path, started: float, chosen: bool) -> None:
+    """Runs what has not ended yet of a comparison, and reports on the whole."""
+    with RunFolder(path).held():
+        folders = comparison.runs(path)
+        for number, (method, folder) in enumerate(folders.items(), 1):
+            print(f"\n--- {method}, {number} of {len(folders)} methods", flush=True)
+            try:
+                _go_on(folder, started, chosen)
+            except UserError as error:
+                raise UserError(f"{method}: {error} (then: python train.py --resume {path})") from error
+            except SystemExit:  # a signal; the run has been saved and has said how to go on with it alone
+                print(f"and with the whole comparison: python train.py --resume {path}", file=sys.stderr, flush=True)
+                raise
+            jax.clear_caches()  # the next method's programs are others
+            started = time.perf_counter()
+        report = write_report([path], path)
+    print(f"\n{report.text}\n\ncompared {', '.join(folders)}")
+    _say_files(report)
+
+
+def _go_on(folder: RunFolder, started: float, chosen: bool) -> None:
+    """Runs what has not been done yet of a run."""
     with folder.held():
         summary = folder.read_summary()
         if summary is not None:
             print(f"{folder.path} has ended already")
             _conclude(folder, summary)
-            return summary
+            return
         config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
         env = _make_env(config)
-        _announce(config, config, chosen=False)
-        return _run(config, env, folder, started)
+        _announce(config, config, chosen)
+        _run(config, env, folder, started)
 
 
-def _run(config: Config, env: Any, folder: RunFolder, started: float) -> dict[str, Any]:
+def _resolved(asked: Config, env: Any, path: Path) -> Config:
+    """The configuration with task, engine and folder as they are, not as they were called."""
+    # Without the term alpha weighs nothing: a scan over it would train the same member again and again.
+    alpha = {} if METHODS[asked.method].information else {"skills.alpha": 0.0}
+    return configs.replace(asked, env=env.spec.full_name, physics=env.backend, out=str(path), **alpha)
+
+
+def _new_path(config: Config, env: Any, name: str) -> Path:
+    return new_path(config.run.root, f"{env.spec.full_name}-{name}")
+
+
+def _run(config: Config, env: Any, folder: RunFolder, started: float) -> None:
     before_data = time.perf_counter()
     data_path = formats.data_file(download.resolve(config.dataset) if config.dataset else _default_data(config, env))
     print(f"data      {data_path}", flush=True)
@@ -106,9 +146,7 @@ def _run(config: Config, env: Any, folder: RunFolder, started: float) -> dict[st
         data_seconds=data_seconds,
         started=started,
     )
-    draw_curves([folder.path], folder.curves)
     _conclude(folder, summary)
-    return summary
 
 
 def _make_env(config: Config) -> Any:
@@ -167,8 +205,16 @@ def _announce(config: Config, asked: Config, chosen: bool) -> None:
     print(f"run       {config.out}", flush=True)
 
 
-def _conclude(folder: RunFolder, summary: dict[str, Any]) -> None:
-    """The last lines: how it went and where things are."""
+def _conclude(folder: RunFolder, summary: Mapping[str, Any]) -> None:
+    """The report, and the last lines: how it went and where things are."""
+    if not folder.inside.exists():
+        from qdos_brax.methods.inside import look_inside  # here, because scikit-learn takes its time
+
+        try:
+            look_inside(folder.path)
+        except UserError as error:  # the page does without
+            print(f"inside    left out: {error}", file=sys.stderr, flush=True)
+    report = write_report([folder.path], folder.path)
     minutes = summary["wall_seconds"]["total"] / 60
     print(f"\ndone in {minutes:.1f} minutes")
     for member in summary["members"]:
@@ -179,8 +225,13 @@ def _conclude(folder: RunFolder, summary: dict[str, Any]) -> None:
         state = "" if member["status"] == "ok" else ", FROZEN: its numbers were no longer finite"
         print(f"  alpha {member['alpha']:g}, seed {member['seed']}: {result}, {goal}{state}")
     print(f"summary   {folder.summary}")
-    print(f"curves    {folder.curves}")
+    _say_files(report)
     print(f"evaluate  python -m qdos_brax evaluate {folder.path}", flush=True)
+
+
+def _say_files(report: Report) -> None:
+    print(f"report    {report.page}")
+    print(f"curves    {report.curves}", flush=True)
 
 
 def _list(values: Any) -> str:

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
 import pytest
 
 import envs
 from envs import render
+from qdos_brax import config as configs
+from qdos_brax.high_level.sac import SAC
+from qdos_brax.methods import build
+from qdos_brax.runs.checkpoint import CheckpointStore, Position
+from qdos_brax.runs.folder import RunFolder
 
 
 @pytest.fixture
@@ -15,3 +25,26 @@ def opengl() -> None:
         render.Renderer(envs.make("antmaze-medium", physics="mujoco"), 16, 16).close()
     except render.NoOpenGL as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture
+def finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run folder of two members, with everything that an evaluation reads; episodes are cut short."""
+    monkeypatch.setattr(envs.TaskEnv, "episode_length", 25)
+    given = {"seed": (0, 1), "physics": "mujoco", "skills.horizon": 10}
+    config = configs.load_config("antmaze-medium", "smoke", given, [])
+    env, high = envs.make(config.env, physics="mujoco"), config.high_level
+    model = build._skill_model(config, env)
+    sac = SAC(env.observation_size, config.skills.latent_dim, high.hidden, high.ensemble, high.target_subset)
+
+    def member(key: jax.Array) -> dict:
+        normaliser = {"mean": jnp.zeros(29), "scale": jnp.ones(29)}
+        return {"skills": model.init(key), "actor": sac.init(key, 1.0).actor, "normaliser": normaliser}
+
+    folder = RunFolder.create(tmp_path / "run")
+    folder.config.write_text(configs.to_yaml(config), encoding="utf-8")
+    folder.summary.write_text(json.dumps({"members": []}), encoding="utf-8")
+    store = CheckpointStore(folder.checkpoints, configs.config_hash(config))
+    store.save_artifacts(1, jax.jit(jax.vmap(member))(jax.random.split(jax.random.key(0), 2)))
+    store.save(Position(phase=1, chunk=0, rows=0, columns=(), wall_seconds={}), None)
+    return folder.path

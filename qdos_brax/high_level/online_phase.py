@@ -159,8 +159,8 @@ class OnlinePhase:
         return state, metrics
 
     def finish(self, state: OnlinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Adds the actor and what it needs to see; labels, advantages and the guide are done with."""
-        kept = {name: value for name, value in artifacts.items() if name not in ("labels", "advantage", "guide")}
+        """Adds the actor and what it needs to see; labels and the guide are done with."""
+        kept = {name: value for name, value in artifacts.items() if name not in ("labels", "guide")}
         normaliser = self._normalise.repeated(state.env_steps.shape[0])
         return kept | {"actor": state.learners.sac.actor, "normaliser": normaliser}
 

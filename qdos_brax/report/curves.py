@@ -1,9 +1,8 @@
-"""Learning curves of one run or of several, as a PNG."""
+"""Learning curves and scans, as PNGs."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import itertools
 from pathlib import Path
 
 import matplotlib
@@ -12,80 +11,105 @@ matplotlib.use("Agg")  # no display is needed to write a file
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from qdos_brax.config import from_yaml
-from qdos_brax.runs.folder import RunFolder, user_errors
-from qdos_brax.runs.metrics import Row, read_rows
+from qdos_brax.report.parts import PALETTE
+from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
+from qdos_brax.report.study import Study, plain, short
+from qdos_brax.runs.folder import replacing
 
-_PANELS = (("eval/success", "success"), ("eval/return", "return"))
-_NOT_SCANNED = {"member", "seed", "phase"}
+MEASURES = (("eval/success", "success"), ("eval/return", "return"))
 
 
-def draw_curves(runs: Sequence[Path], out: Path) -> None:
-    """Draws success and return over the environment steps: thin lines for members, a thick one for their mean.
+def draw_curves(study: Study, out: Path) -> None:
+    """Draws success and return over the environment steps, a row of panels per task.
 
-    Members that differ in nothing but the seed share a colour.
+    A thick line is the mean of a setting's members, the band its 95 % bootstrap interval, a thin line a member; dashed
+    across: a method that only learned offline.
 
     Args:
-        runs: run folders.
+        study: what was run.
         out: the picture; its folder must exist.
 
     Raises:
-        UserError: a run has no metrics, or the picture cannot be written.
+        UserError: the picture cannot be written.
     """
-    figure, axes = plt.subplots(1, len(_PANELS), figsize=(10, 4), layout="constrained")
-    titles = []
-    for path in runs:
-        folder = RunFolder.open(path)
-        config = from_yaml(folder.config)
-        titles.append(config.env)
-        rows = read_rows(folder.metrics)
-        prefix = f"{path.name}: " if len(runs) > 1 else ""
-        for label, group in _by_setting(rows).items():
-            for axis, (column, _) in zip(axes, _PANELS, strict=True):
-                _draw_group(axis, group, column, f"{prefix}{config.method} {label}")
-    for axis, (column, name) in zip(axes, _PANELS, strict=True):
-        axis.set_xlabel("environment steps")
-        axis.set_ylabel(name)
-        axis.grid(alpha=0.3)
-        if axis.lines:
-            axis.legend(fontsize="small")
-        else:
-            axis.text(0.5, 0.5, f"no {column} yet", ha="center", va="center", transform=axis.transAxes)
-    axes[0].set_ylim(-0.02, 1.02)
-    figure.suptitle(", ".join(dict.fromkeys(titles)))
-    with user_errors(out):
-        figure.savefig(out, dpi=120)
-    plt.close(figure)
+    tasks = len(study.tasks)
+    figure, axes = plt.subplots(tasks, len(MEASURES), figsize=(11, 4 * tasks), layout="constrained", squeeze=False)
+    colours = colours_of(study)
+    for row, task in zip(axes, study.tasks, strict=True):
+        for axis, (column, name) in zip(row, MEASURES, strict=True):
+            for curve in curves(study, task, column):
+                _draw_curve(axis, curve, colours[curve.setting.label])
+            axis.set_xlabel("environment steps")
+            axis.set_ylabel(name)
+            axis.set_title(task)
+            axis.grid(alpha=0.3)
+            if not axis.lines:
+                axis.text(0.5, 0.5, f"no {column} yet", ha="center", va="center", transform=axis.transAxes)
+        row[0].set_ylim(-0.02, 1.02)
+        if row[0].lines:
+            row[0].legend(fontsize="small")
+    _save(figure, out)
 
 
-def _by_setting(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
-    """{"alpha 0.3": {member: its rows}}: members grouped by everything that was scanned but the seed."""
-    groups: dict[str, dict[str, list[Row]]] = {}
-    for row in rows:
-        # What tells members apart stands before the phase, see MetricsTable.
-        columns = list(row)
-        scanned = [name for name in columns[: columns.index("phase")] if name not in _NOT_SCANNED]
-        label = ", ".join(f"{name} {row[name]}" for name in scanned)
-        groups.setdefault(label, {}).setdefault(row["member"], []).append(row)
-    return groups
+def draw_scans(study: Study, out: Path) -> bool:
+    """Draws final success over everything that was varied, a panel for each; False, and no file, if nothing was."""
+    found = scans(study)
+    if not found:
+        return False
+    figure, axes = plt.subplots(1, len(found), figsize=(5.5 * len(found), 4), layout="constrained", squeeze=False)
+    for axis, scan in zip(axes[0], found, strict=True):
+        _draw_scan(axis, scan)
+    _save(figure, out)
+    return True
 
 
-def _draw_group(axis: Axes, members: dict[str, list[Row]], column: str, label: str) -> None:
-    curves = [_curve(rows, column) for rows in members.values()]
-    curves = [curve for curve in curves if curve.size]
-    if not curves:
+def colours_of(study: Study) -> dict[str, str]:
+    """One colour per setting, by label; the same in every figure of a report."""
+    return {setting.label: PALETTE[i % len(PALETTE)] for i, setting in enumerate(study.settings)}
+
+
+def positions(line: ScanLine, scan: Scan) -> tuple[list[float], list[str] | None]:
+    """Where a scan's values lie on the axis: numbers where they are, words one after another, with their names."""
+    every = [value for other in scan.lines for value in other.values]
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in every):
+        return [float(value) for value in line.values], None
+    names = list(dict.fromkeys(map(plain, every)))
+    return [float(names.index(plain(value))) for value in line.values], names
+
+
+def _draw_curve(axis: Axes, curve: Curve, colour: str) -> None:
+    label = f"{curve.setting.label} ({len(curve.members)})"
+    if curve.offline:
+        axis.axhline(curve.mean[-1], color=colour, linestyle="--", label=f"{label}, offline")
+        axis.axhspan(curve.low[-1], curve.high[-1], color=colour, alpha=0.1, linewidth=0)
         return
-    steps = sorted({step for curve in curves for step in curve[0]})
-    mean = np.mean([np.interp(steps, *curve) for curve in curves], axis=0)
-    (line,) = axis.plot(steps, mean, linewidth=2, marker="o", markersize=3, label=label)
-    if len(curves) > 1:
-        for curve in curves:
-            axis.plot(*curve, color=line.get_color(), linewidth=0.8, alpha=0.5)
+    axis.plot(curve.steps, curve.mean, linewidth=2, marker="o", markersize=3, color=colour, label=label)
+    if len(curve.members) > 1:
+        axis.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
+        for _, xy in curve.members:
+            axis.plot(*xy, color=colour, linewidth=0.7, alpha=0.4)
 
 
-def _curve(rows: Sequence[Row], column: str) -> np.ndarray:
-    """float[2, points]: environment steps and values; empty if nothing was measured."""
-    points = [(float(row["env_steps"] or 0), float(row[column])) for row in rows if row.get(column)]
-    points = [point for point in points if not math.isnan(point[1])]
-    return np.asarray(points).T if points else np.empty((2, 0))
+def _draw_scan(axis: Axes, scan: Scan) -> None:
+    for line, colour in zip(scan.lines, itertools.cycle(PALETTE), strict=False):
+        x, _ = positions(line, scan)
+        errors = np.nan_to_num(np.stack([line.mean - line.low, line.high - line.mean]))
+        label = f"{line.label} (mean, 95 %)"
+        axis.errorbar(x, line.mean, errors, color=colour, marker="o", capsize=3, linewidth=2, label=label)
+        for at, members in zip(x, line.members, strict=True):
+            axis.plot([at] * len(members), [m.success for m in members], ".", color=colour, alpha=0.5)
+    ticks = sorted({at for line in scan.lines for at in positions(line, scan)[0]})
+    axis.set_xticks(ticks, positions(scan.lines[0], scan)[1] or [plain(tick) for tick in ticks])
+    axis.set(xlabel=short(scan.key), ylabel="success at the last evaluation", title=scan.task, ylim=(-0.02, 1.02))
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize="small")
+
+
+def _save(figure: Figure, out: Path) -> None:
+    try:
+        with replacing(out) as partial:
+            figure.savefig(partial, dpi=120)
+    finally:
+        plt.close(figure)

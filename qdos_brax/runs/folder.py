@@ -24,7 +24,7 @@ class RunFolder:
         metrics: metrics.csv, one row per member and log point.
         provenance: run.json: the command, the data file's hash, the versions of the packages.
         summary: summary.json, present once the run has ended.
-        curves: curves.png.
+        inside: inside.npz, what a look inside the finished run found.
         checkpoints: folder of the checkpoints.
     """
 
@@ -34,7 +34,7 @@ class RunFolder:
         self.provenance = self.path / "run.json"
         self.metrics = self.path / "metrics.csv"
         self.summary = self.path / "summary.json"
-        self.curves = self.path / "curves.png"
+        self.inside = self.path / "inside.npz"
         self.checkpoints = self.path / "checkpoints"
 
     @classmethod

@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 
 from qdos_brax.errors import UserError
-from qdos_brax.report.curves import draw_curves
 from qdos_brax.runs.folder import RunFolder, new_path, write_text
-from tests.runs import toy
 
 
 def made(path: Path) -> RunFolder:
@@ -65,11 +63,3 @@ def test_new_path_never_repeats(tmp_path: Path) -> None:
     first = new_path(tmp_path, "a")
     first.mkdir()
     assert new_path(tmp_path, "a") != first
-
-
-def test_curves_are_drawn(tmp_path: Path) -> None:
-    toy.run(tmp_path / "run")
-    draw_curves([tmp_path / "run"], tmp_path / "one.png")
-    draw_curves([tmp_path / "run", tmp_path / "run"], tmp_path / "two.png")
-    assert (tmp_path / "one.png").stat().st_size > 10_000
-    assert (tmp_path / "one.png").read_bytes() != (tmp_path / "two.png").read_bytes()

@@ -1,0 +1,274 @@
+"""What was run, as tables and figures want it: members of finished runs, grouped by method and by what was varied."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from qdos_brax.config import Config, from_yaml, nearest
+from qdos_brax.config.schema import get, leaves
+from qdos_brax.errors import UserError
+from qdos_brax.runs import comparison
+from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.metrics import Row, read_rows
+
+DATA = "data"  # the key under which a setting holds the data file's hash
+# What tells no two settings apart: the names of the task and of the method (they do that themselves), seeds and places.
+_NOT_A_SETTING = {"env", "method", "seed", "out", "dataset", "run.root", "run.checkpoint_seconds"}
+# Where methods that are compared on one task have to agree.
+_BUDGET = ("preset", "physics", "high_level.env_steps", "eval.episodes", DATA)
+_MOST_NAMED = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Member:
+    """One seed with one setting, trained to its end.
+
+    Attributes:
+        run: its run folder.
+        task: the task's full name.
+        method: the recipe's name.
+        seed: its seed.
+        values: by dotted key, everything in the configuration that may tell two settings apart.
+        success: at the last evaluation, 0 to 1; nan if it was never evaluated.
+        first_goal: environment steps when the goal was first reached; nan if never.
+        frozen: whether it was frozen because its numbers were no longer finite.
+        rows: its rows of metrics.csv.
+    """
+
+    run: Path
+    task: str
+    method: str
+    seed: int
+    values: dict[str, Any]
+    success: float
+    first_goal: float
+    frozen: bool
+    rows: list[Row]
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One run folder.
+
+    Attributes:
+        path: the folder.
+        config: its configuration.
+        provenance: run.json; empty where there is none.
+        summary: summary.json.
+        members: in the population's order.
+    """
+
+    path: Path
+    config: Config
+    provenance: dict[str, Any]
+    summary: dict[str, Any]
+    members: list[Member]
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """A method with one choice of what was varied of it: one row of the tables, one colour of the figures.
+
+    Attributes:
+        label: "qdos" or "qdos, alpha 0.3".
+        method: the recipe's name.
+        values: what was varied, by dotted key.
+        members: by task, one per seed.
+    """
+
+    label: str
+    method: str
+    values: dict[str, Any]
+    members: dict[str, list[Member]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """Everything that one report is about.
+
+    Attributes:
+        runs: the run folders.
+        tasks: full names, sorted.
+        settings: in the order in which they were given.
+        reference: the setting that the others are compared with.
+        notes: what a reader must know before believing a comparison, one line each.
+    """
+
+    runs: list[Run]
+    tasks: list[str]
+    settings: list[Setting]
+    reference: Setting
+    notes: list[str]
+
+
+def read_study(paths: Sequence[Path], reference: str | None = None) -> Study:
+    """Reads runs and comparisons.
+
+    Args:
+        paths: folders of either kind.
+        reference: the method or label to compare with; None for supe, or else the first.
+
+    Raises:
+        UserError: a folder is no run, has not ended or holds nothing; two members are the same; there is no such
+            reference.
+    """
+    folders = [folder for path in paths for folder in _folders(path)]
+    counts = Counter(folder.path.resolve() for folder in folders)
+    for path, count in counts.items():
+        if count > 1:
+            raise UserError(f"{path} was given twice; name each run once")
+    runs = [_read_run(folder) for folder in folders]
+    settings = _settings([member for run in runs for member in run.members])
+    return Study(
+        runs=runs,
+        tasks=sorted({member.task for run in runs for member in run.members}),
+        settings=settings,
+        reference=_reference(settings, reference),
+        notes=list(_notes(settings)),
+    )
+
+
+def _folders(path: Path) -> list[RunFolder]:
+    if comparison.is_comparison(path):
+        return list(comparison.runs(path).values())
+    return [RunFolder.open(path)]
+
+
+def _read_run(folder: RunFolder) -> Run:
+    config = from_yaml(folder.config)
+    summary = folder.read_summary()
+    if summary is None:
+        raise UserError(f"the run in {folder.path} has not ended; go on with: python train.py --resume {folder.path}")
+    rows = read_rows(folder.metrics)
+    if not rows:
+        raise UserError(f"{folder.metrics} holds no rows; the run cannot be reported")
+    provenance = _provenance(folder)
+    values = {key: get(config, key) for key, _ in leaves(Config) if key not in _NOT_A_SETTING}
+    values[DATA] = provenance.get("dataset", {}).get("sha256", "")[:8]
+    by_member: dict[str, list[Row]] = {}
+    for row in rows:
+        by_member.setdefault(row["member"], []).append(row)
+    try:
+        entries = enumerate(summary["members"])
+        members = [_member(folder.path, summary, values, entry, by_member[str(i)]) for i, entry in entries]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{folder.summary} does not fit {folder.metrics.name} or is damaged ({error!r}); remove it, and --resume "
+            "writes it again"
+        ) from error
+    return Run(folder.path, config, provenance, summary, members)
+
+
+def _member(
+    path: Path, summary: dict[str, Any], values: dict[str, Any], entry: dict[str, Any], rows: list[Row]
+) -> Member:
+    own = {key: value for key, value in entry.items() if "." in key} | {"skills.alpha": entry["alpha"]}
+    return Member(
+        run=path,
+        task=str(summary["env"]),
+        method=str(summary["method"]),
+        seed=int(entry["seed"]),
+        values=values | own,
+        success=_number(entry["eval_success"]),
+        first_goal=_number(entry["first_goal_step"]),
+        frozen=entry["status"] != "ok",
+        rows=rows,
+    )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _provenance(folder: RunFolder) -> dict[str, Any]:
+    if not folder.provenance.is_file():
+        return {}
+    try:
+        return dict(json.loads(folder.provenance.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {folder.provenance}: {error}") from error
+
+
+# --- Settings --------------------------------------------------------------------------------------------------
+
+
+def _settings(members: Sequence[Member]) -> list[Setting]:
+    """Members of one method and of equal values belong together, whatever the run folder."""
+    varied = {method: _varied(members, method) for method in dict.fromkeys(member.method for member in members)}
+    settings: dict[tuple[str, ...], Setting] = {}
+    for member in members:
+        values = {key: member.values[key] for key in varied[member.method]}
+        named = values if len(values) <= _MOST_NAMED else {"run": member.run}
+        label = ", ".join([member.method, *(f"{short(key)} {plain(value)}" for key, value in named.items())])
+        setting = settings.setdefault((label, *map(str, values.values())), Setting(label, member.method, values, {}))
+        others = setting.members.setdefault(member.task, [])
+        for other in others:
+            if other.seed == member.seed:
+                where = f"{label}, seed {member.seed} on {member.task}"
+                raise UserError(f"{other.run} and {member.run} both hold {where}; leave one out")
+        others.append(member)
+    return list(settings.values())
+
+
+def _varied(members: Sequence[Member], method: str) -> list[str]:
+    """The keys in which members of the method differ on one and the same task."""
+    keys: dict[str, None] = {}
+    for task in dict.fromkeys(member.task for member in members):
+        group = [member.values for member in members if (member.method, member.task) == (method, task)]
+        for key in group[0] if group else ():
+            if any(values[key] != group[0][key] for values in group):
+                keys[key] = None
+    if any(key.startswith("data.") for key in keys):
+        keys.pop(DATA, None)  # the file differs because its recipe does
+    return list(keys)
+
+
+def short(key: str) -> str:
+    """The last word of a dotted key, in words: "advantage temperature"."""
+    return key.rpartition(".")[2].replace("_", " ")
+
+
+def plain(value: Any) -> str:
+    """A value of a configuration in few characters."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _reference(settings: Sequence[Setting], name: str | None) -> Setting:
+    if name is None:
+        return next((setting for setting in settings if setting.method == "supe"), settings[0])
+    for setting in settings:
+        if name in (setting.label, setting.method):
+            return setting
+    labels = [setting.label for setting in settings]
+    raise UserError(f"--reference {name}: no such method was run{nearest(name, labels)}; there are {'; '.join(labels)}")
+
+
+def _notes(settings: Sequence[Setting]) -> Iterable[str]:
+    """Unequal budgets, data and numbers of seeds; frozen and never evaluated members."""
+    everyone = [member for setting in settings for members in setting.members.values() for member in members]
+    for task in sorted({member.task for member in everyone}):
+        on_task = [member for member in everyone if member.task == task]
+        for key in _BUDGET:
+            found: dict[str, list[str]] = {}
+            for member in on_task:
+                labels = found.setdefault(plain(member.values[key]) or "unknown", [])
+                if member.method not in labels:
+                    labels.append(member.method)
+            if len(found) > 1:
+                parts = "; ".join(f"{value}: {', '.join(methods)}" for value, methods in found.items())
+                yield f"{task}: not all had the same {short(key)} ({parts})"
+        counts = {setting.label: len(setting.members[task]) for setting in settings if task in setting.members}
+        if len(set(counts.values())) > 1:
+            yield f"{task}: unequal numbers of seeds ({', '.join(f'{k}: {v}' for k, v in counts.items())})"
+    for member in everyone:
+        name = f"{member.run} ({member.method}, seed {member.seed})"
+        if member.frozen:
+            yield f"{name} was frozen: its numbers were no longer finite; it counts with its last evaluation"
+        if math.isnan(member.success):
+            yield f"{name} was never evaluated and is left out of table 1"

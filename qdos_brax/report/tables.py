@@ -1,0 +1,186 @@
+"""The paper's tables of what was run: final success, and environment steps to the first goal."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import math
+from collections.abc import Sequence
+
+from qdos_brax.report.statistics import Estimate, interquartile_mean, mean_std, probability_of_improvement
+from qdos_brax.report.study import Member, Setting, Study
+
+_ALL = "all tasks"
+_NONE = "-"
+_CsvRow = dict[str, str | float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Cells of text under a heading.
+
+    Attributes:
+        title: what the table shows.
+        header: names of the columns; the first one is that of the rows' names.
+        rows: the cells.
+        note: how to read it.
+        words: how many of the first columns hold words, not numbers.
+    """
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    note: str = ""
+    words: int = 1
+
+    def text(self) -> str:
+        """For a terminal."""
+        widths = [max(map(len, column)) for column in zip(self.header, *self.rows, strict=True)]
+        lines = [
+            "  ".join(
+                cell.ljust(width) if i < self.words else cell.rjust(width)
+                for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+            )
+            for row in (self.header, *self.rows)
+        ]
+        return "\n".join(line.rstrip() for line in (self.title, *lines, self.note) if line)
+
+    def markdown(self) -> str:
+        """For a README."""
+        rule = ["---"] * self.words + ["---:"] * (len(self.header) - self.words)
+        cells = [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in (self.header, rule, *self.rows)]
+        return "\n\n".join(part for part in (f"**{self.title}**", "\n".join(cells), self.note) if part)
+
+
+def tables(study: Study) -> list[Table]:
+    """Table 1 (with what few seeds can say about it) and table 2."""
+    return [_success_table(study), _statistics_table(study), _first_goal_table(study)]
+
+
+def success_csv(study: Study) -> str:
+    """Table 1 in numbers, one row per setting and task, and one over all tasks where there are several.
+
+    Success and its statistics are shares, 0 to 1; what there are too few seeds for is empty.
+    """
+    rows: list[_CsvRow] = []
+    for setting, task, scores, improvement in _statistics(study):
+        mean, std = mean_std([score for group in scores for score in group])
+        rows.append(
+            {
+                "task": task,
+                "method": setting.label,
+                "seeds": sum(map(len, scores)),
+                "mean": mean,
+                "std": std,
+                **_named("iqm", interquartile_mean(scores)),
+                "reference": study.reference.label,
+                **_named("improvement", improvement or Estimate(math.nan, math.nan, math.nan)),
+            }
+        )
+    return _csv(rows)
+
+
+def first_goal_csv(study: Study) -> str:
+    """Table 2 in numbers, one row per setting and task: environment steps of the seeds that reached the goal."""
+    rows: list[_CsvRow] = []
+    for setting in study.settings:
+        for task in study.tasks:
+            steps, seeds = _first_goals(setting.members.get(task, []))
+            if seeds:
+                mean, std = mean_std(steps)
+                reached = len(steps)
+                row: _CsvRow = {"task": task, "method": setting.label, "seeds": seeds, "reached": reached}
+                rows.append({**row, "mean": mean, "std": std})
+    return _csv(rows)
+
+
+def _success_table(study: Study) -> Table:
+    rows = [
+        [setting.label, *(_percent(*mean_std(_scores(setting, task))) for task in study.tasks)]
+        for setting in study.settings
+    ]
+    note = "standard deviation over seeds, with n - 1; of one seed there is none"
+    return Table("Table 1. Success at the last evaluation (%), mean ± std", ["method", *study.tasks], rows, note)
+
+
+def _statistics_table(study: Study) -> Table:
+    several = len(study.settings) > 1
+    rows = []
+    for setting, task, scores, improvement in _statistics(study):
+        row = [setting.label, task, str(sum(map(len, scores))), _interval(interquartile_mean(scores), 100, "{:.0f}")]
+        rows.append([*row, _interval(improvement, 1, "{:.2f}")] if several else row)
+    header = ["method", "task", "seeds", "IQM (%) [95 %]"]
+    if several:
+        header.append(f"P(better than {study.reference.label}) [95 %]")
+    note = "interquartile mean (of fewer than four scores: the mean); bootstrap over seeds within each task"
+    return Table("Table 1, continued. What this many seeds can say", header, rows, note, words=2)
+
+
+def _first_goal_table(study: Study) -> Table:
+    def cell(setting: Setting, task: str) -> str:
+        steps, seeds = _first_goals(setting.members.get(task, []))
+        mean, std = mean_std(steps)
+        if not seeds:
+            return _NONE
+        words = _NONE if math.isnan(mean) else f"{mean:,.0f}" + ("" if math.isnan(std) else f" ± {std:,.0f}")
+        return f"{words} ({len(steps)}/{seeds})"
+
+    rows = [[setting.label, *(cell(setting, task) for task in study.tasks)] for setting in study.settings]
+    note = "over the seeds that reached it (how many did, of how many); those that did not are in no mean"
+    return Table("Table 2. Environment steps to the first goal, mean ± std", ["method", *study.tasks], rows, note)
+
+
+def _statistics(study: Study) -> list[tuple[Setting, str, list[list[float]], Estimate | None]]:
+    """(setting, task or all of them, scores by task, chance to beat the reference) of everything that was evaluated."""
+    found = []
+    for setting in study.settings:
+        for task in (*study.tasks, *([_ALL] if len(study.tasks) > 1 else [])):
+            tasks = study.tasks if task == _ALL else [task]
+            scores = [_scores(setting, name) for name in tasks]
+            if not all(scores):
+                continue
+            reference = [_scores(study.reference, name) for name in tasks]
+            compared = setting is not study.reference and all(reference)
+            found.append((setting, task, scores, probability_of_improvement(scores, reference) if compared else None))
+    return found
+
+
+def _scores(setting: Setting, task: str) -> list[float]:
+    return [member.success for member in setting.members.get(task, []) if not math.isnan(member.success)]
+
+
+def _first_goals(members: Sequence[Member]) -> tuple[list[float], int]:
+    return [member.first_goal for member in members if not math.isnan(member.first_goal)], len(members)
+
+
+def _percent(mean: float, std: float) -> str:
+    if math.isnan(mean):
+        return _NONE
+    return f"{100 * mean:.0f}" + ("" if math.isnan(std) else f" ± {100 * std:.0f}")
+
+
+def _interval(estimate: Estimate | None, scale: float, form: str) -> str:
+    if estimate is None:
+        return _NONE
+    value, low, high = (form.format(scale * number) for number in estimate)
+    return value if math.isnan(estimate.low) else f"{value} [{low}, {high}]"
+
+
+def _named(name: str, estimate: Estimate) -> dict[str, float]:
+    return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
+
+
+def _csv(rows: Sequence[_CsvRow]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]) if rows else [], lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({name: _cell(value) for name, value in row.items()})
+    return text.getvalue()
+
+
+def _cell(value: str | float) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.6g}"
+    return str(value)

@@ -1,0 +1,56 @@
+"""A comparison: a folder that holds one run folder per method, and the order in which they are run."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+from qdos_brax.errors import UserError
+from qdos_brax.runs.folder import RunFolder, user_errors, write_text
+
+_FILE = "comparison.json"
+
+
+def is_comparison(path: str | Path) -> bool:
+    """Whether there is a comparison at ``path``."""
+    return (Path(path) / _FILE).is_file()
+
+
+def create(path: Path, configs: Mapping[str, str]) -> None:
+    """Makes the folder with a run folder per method, none of them begun; all at once or not at all.
+
+    Args:
+        path: the comparison's folder, absent or empty.
+        configs: config.yaml by method, in the order of the runs.
+
+    Raises:
+        UserError: there is something at ``path``, or it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    with user_errors(path):
+        if is_comparison(path):
+            raise UserError(f"{path} holds a comparison already; go on with --resume {path} or choose another --out")
+        if path.exists() and any(path.iterdir()):
+            raise UserError(f"{path} is not empty; choose another --out")
+        shutil.rmtree(partial, ignore_errors=True)
+        for method, text in configs.items():
+            (partial / method).mkdir(parents=True)
+            write_text(RunFolder(partial / method).config, text)
+        write_text(partial / _FILE, json.dumps({"methods": list(configs)}) + "\n")
+        os.replace(partial, path)
+
+
+def runs(path: Path) -> dict[str, RunFolder]:
+    """The run folders by method, in order.
+
+    Raises:
+        UserError: there is no comparison at ``path``, or it is damaged.
+    """
+    try:
+        methods = json.loads((path / _FILE).read_text(encoding="utf-8"))["methods"]
+        return {str(method): RunFolder.open(path / method) for method in methods}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"cannot read {path / _FILE} ({error}); report or resume its run folders one by one") from error

@@ -1,0 +1,174 @@
+"""What is read from run folders, how members are grouped, and one clear line for what cannot be reported."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qdos_brax import cli
+from qdos_brax.report.series import curves, scans
+from qdos_brax.report.study import read_study
+from qdos_brax.report.tables import tables
+from qdos_brax.report.write import write_report
+from qdos_brax.runs import comparison
+from tests.report.folders import write_run
+
+
+def labels(*paths: Path) -> dict[str, int]:
+    return {s.label: sum(map(len, s.members.values())) for s in read_study(paths).settings}
+
+
+def test_seeds_of_separate_commands_belong_together(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", success=[0.5], seeds=[0])
+    b = write_run(tmp_path / "b", success=[0.7, 0.9], seeds=[1, 2])
+    assert labels(a, b) == {"qdos": 3}
+
+
+def test_members_are_told_apart_by_what_was_varied(tmp_path: Path) -> None:
+    scan = write_run(tmp_path / "scan", success={0.1: [0.5, 0.6], 0.3: [0.7, 0.8]})
+    supe = write_run(tmp_path / "supe", "supe", [0.1, 0.2])
+    assert labels(scan, supe) == {"qdos, alpha 0.1": 2, "qdos, alpha 0.3": 2, "supe": 2}
+    other = write_run(tmp_path / "other", "supe", [0.3], more="values: {estimator: iql}\n")
+    assert labels(supe, other) == {"supe, estimator graph": 2, "supe, estimator iql": 1}
+    data = write_run(tmp_path / "data", "supe", [0.3], data="e" * 64)
+    assert labels(supe, data) == {"supe, data dddddddd": 2, "supe, data eeeeeeee": 1}
+
+
+def test_tasks_have_alphas_of_their_own(tmp_path: Path) -> None:
+    """What differs between tasks alone is no variation: one row, as in the paper's table."""
+    a = write_run(tmp_path / "a", success={0.3: [0.5]})
+    b = write_run(tmp_path / "b", success={0.1: [0.9]}, env="antsoccer-arena-task4")
+    assert labels(a, b) == {"qdos": 2}
+
+
+def test_runs_that_differ_in_much_are_named_by_their_folders(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a")
+    b = write_run(
+        tmp_path / "b", more="values: {n_step: 3, max_nodes: 9}\nlabels: {rnd_features: 8}\neval: {episodes: 3}\n"
+    )
+    assert labels(a, b) == {f"qdos, run {a}": 1, f"qdos, run {b}": 1}
+
+
+def test_tables_by_hand(tmp_path: Path) -> None:
+    goals = [10_000, 10_000, 20_000]
+    runs = [
+        write_run(tmp_path / "q", success=[0.9, 0.95, 1.0], first_goals=goals),
+        write_run(tmp_path / "s", "supe", [0.2, 0.4, 0.95], first_goals=[5_000, None, None]),
+    ]
+    success, detail, goal = tables(read_study(runs))
+    assert success.rows == [["qdos", "95 ± 5"], ["supe", "52 ± 39"]]
+    # 0.9 beats two of three, 0.95 beats two and ties with one, 1.0 beats all: (2 + 2.5 + 3) / 9.
+    assert detail.rows[0][-1].startswith("0.83 [") and detail.rows[1][-1] == "-"
+    assert detail.rows[0][3] == "95 [90, 100]"
+    assert goal.rows == [["qdos", "13,333 ± 5,774 (3/3)"], ["supe", "5,000 (1/3)"]]
+    assert "| qdos | 95 ± 5 |" in success.markdown()
+    assert success.text().splitlines()[2] == f"{'qdos':6}  {'95 ± 5':>20}"
+    report = write_report(runs, tmp_path / "out")
+    with (tmp_path / "out" / "table1.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["mean"] for row in rows] == ["0.95", "0.516667"] and rows[0]["improvement"] == f"{7.5 / 9:.6g}"
+    assert rows[1]["improvement"] == "" and rows[0]["reference"] == "supe"
+    table2 = (tmp_path / "out" / "table2.csv").read_text().splitlines()
+    assert table2[1:] == ["antmaze-medium-task1,qdos,3,3,13333.3,5773.5", "antmaze-medium-task1,supe,3,1,5000,"]
+    assert {file.name for file in report.files} == {file.name for file in (tmp_path / "out").iterdir()}
+
+
+def test_curves_meet_the_members_in_the_middle(tmp_path: Path) -> None:
+    study = read_study([write_run(tmp_path / "a", success=[0.4, 0.8])])
+    (curve,) = curves(study, "antmaze-medium-task1", "eval/success")
+    assert curve.steps.tolist() == [1000, 2000, 4000]
+    np.testing.assert_allclose(curve.mean, [0.15, 0.3, 0.6])
+    # Two members: the interval's ends are the members themselves, for each is drawn twice in a quarter of the cases.
+    np.testing.assert_allclose([curve.low, curve.high], [[0.1, 0.2, 0.4], [0.2, 0.4, 0.8]])
+
+
+def test_scan_by_hand(tmp_path: Path) -> None:
+    study = read_study([write_run(tmp_path / "a", success={0.3: [0.7, 0.9], 0.1: [0.5, None]})])
+    (scan,) = scans(study)
+    (line,) = scan.lines
+    assert scan.key == "skills.alpha" and line.values == [0.1, 0.3] and line.label == "qdos"
+    assert line.mean.tolist() == pytest.approx([0.5, 0.8]) and [len(group) for group in line.members] == [1, 2]
+
+
+def test_a_reader_is_warned(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", success=[0.5, None])
+    b = write_run(tmp_path / "b", "supe", [0.5], data="e" * 64, more="high_level: {env_steps: 9000}\n")
+    c = write_run(tmp_path / "c", "supe", [0.5], seeds=[4], data="e" * 64, more="high_level: {env_steps: 9000}\n")
+    text = (c / "summary.json").read_text()
+    (c / "summary.json").write_text(text.replace('"ok"', '"nan"'))
+    notes = read_study([a, b, c]).notes
+    assert len(notes) == 4
+    assert "not all had the same env steps (200000: qdos; 9000: supe)" in notes[0]
+    assert "not all had the same data (dddddddd: qdos; eeeeeeee: supe)" in notes[1]
+    assert "a (qdos, seed 1) was never evaluated" in notes[2] and "c (supe, seed 4) was frozen" in notes[3]
+    assert "unequal numbers of seeds (qdos: 2, supe: 1)" in read_study([a, b]).notes[2]
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ("none", "is not a run folder"),
+        ("unfinished", "has not ended; go on with: python train.py --resume"),
+        ("empty", "holds no rows"),
+        ("no metrics", "cannot read"),
+        ("cut summary", "cannot read"),
+        ("foreign summary", "does not fit metrics.csv or is damaged"),
+        ("fewer rows", "does not fit metrics.csv or is damaged"),
+        ("cut provenance", "cannot read"),
+        ("wrong config", "unknown key 'sed', did you mean 'seed'?"),
+        ("twice", "was given twice"),
+        ("copy", "both hold qdos, seed 0 on antmaze-medium-task1; leave one out"),
+        ("comparison", "has not ended; go on with"),
+        ("reference", "--reference spue: no such method was run, did you mean 'supe'?"),
+        ("file in the way", "--out"),
+    ],
+)
+def test_what_cannot_be_reported_is_one_line(
+    broken: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out = write_run(tmp_path / "run"), tmp_path / "out"
+    arguments = [str(run)]
+    summary, metrics = run / "summary.json", run / "metrics.csv"
+    match broken:
+        case "none":
+            arguments = [str(tmp_path)]
+        case "unfinished":
+            summary.unlink()
+        case "empty":
+            metrics.write_text(metrics.read_text().splitlines()[0] + "\n")
+        case "no metrics":
+            metrics.unlink()
+        case "cut summary":
+            summary.write_text(summary.read_text()[:50])
+        case "foreign summary":
+            summary.write_text("{}")
+        case "fewer rows":
+            metrics.write_text(
+                "\n".join(line for line in metrics.read_text().splitlines() if line[0] != "0") + "\n1,,,,,,,,,\n"
+            )
+        case "cut provenance":
+            (run / "run.json").write_text("{")
+        case "wrong config":
+            (run / "config.yaml").write_text("sed: 3\n")
+        case "twice":
+            arguments.append(f"{run}/")
+        case "copy":
+            arguments.append(str(shutil.copytree(run, tmp_path / "copy")))
+        case "comparison":
+            comparison.create(tmp_path / "both", {"qdos": "env: antmaze-medium-task1\n"})
+            arguments = [str(tmp_path / "both")]
+        case "reference":
+            arguments += [str(write_run(tmp_path / "s", "supe")), "--reference", "spue"]
+        case "file in the way":
+            out.touch()
+    try:
+        code = cli.main(["report", *arguments, "--out", str(out)])
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert code == 2 and len(lines) == 1 and message in lines[0]
+    assert not out.is_dir()
