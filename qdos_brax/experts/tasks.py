@@ -15,8 +15,10 @@ from flax import struct
 from envs import models
 from envs.physics.base import PipelineState
 from envs.physics.mujoco_engine import MujocoEngine
-from qdos_brax.experts import policies
+from qdos_brax.experts import policies, symmetry
 from qdos_brax.experts.views import ANT_NQ, ANT_NV, body_view, random_direction, turned, uprightness
+
+from qdos_brax.high_level.sac import Batch
 
 
 class Life(struct.PyTreeNode):
@@ -85,6 +87,10 @@ class Task(Protocol):
         """The step from ``before`` to ``after`` under ``joints``."""
         ...
 
+    def mirror(self, batch: Batch) -> Batch:
+        """The same transitions as a mirror shows them, or ``batch`` itself for a body that is learned as it is."""
+        ...
+
 
 class AntWalking:
     """Reward: ten times the metres along the direction (OGBench's recipe); falling ends it."""
@@ -116,6 +122,10 @@ class AntWalking:
         """See the class."""
         speed = (after.qpos[:2] - before.pipeline.qpos[:2]) @ before.direction
         return Verdict(10.0 * speed, ant_is_up(after.qpos), jnp.zeros((), bool), {"speed": speed})
+
+    def mirror(self, batch: Batch) -> Batch:
+        """The batch itself."""
+        return batch
 
 
 class AntDribbling:
@@ -176,6 +186,10 @@ class AntDribbling:
         measures = {"speed": way[0], "aside": jnp.abs(way[1]), "gap": gap}
         return Verdict(reward, ant_is_up(after.qpos), gap > self.LOST, measures)
 
+    def mirror(self, batch: Batch) -> Batch:
+        """The batch itself."""
+        return batch
+
 
 def ant_is_up(qpos: jax.Array) -> jax.Array:
     """bool[...]: the torso's height is within [0.2, 1.0] m and its own z axis points up."""
@@ -213,11 +227,11 @@ class HumanoidWalking:
 
     def observe(self, life: Life) -> jax.Array:
         """The body's view."""
-        return body_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
+        return policies.humanoid_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
 
     def joints(self, life: Life, action: jax.Array) -> jax.Array:
-        """The action itself."""
-        return action
+        """Springs to where the action says."""
+        return policies.humanoid_joints(life.pipeline.qpos, action)
 
     def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
         """See the class."""
@@ -232,6 +246,14 @@ class HumanoidWalking:
         )
         return Verdict(
             reward, humanoid_is_up(after.qpos), jnp.zeros((), bool), {"speed": velocity[0], "facing": facing}
+        )
+
+    def mirror(self, batch: Batch) -> Batch:
+        """Left and right exchanged: the body is symmetric, the reward as well."""
+        return batch._replace(
+            observation=symmetry.mirrored_view(batch.observation),
+            action=symmetry.mirrored_action(batch.action),
+            next_observation=symmetry.mirrored_view(batch.next_observation),
         )
 
 

@@ -158,8 +158,9 @@ class Trainer:
         """``actor_every`` critic updates and one of the actor."""
         info: dict[str, jax.Array] = {}
         for sub_key in jax.random.split(key, self.sizes.actor_every):
-            sample_key, critic_key, actor_key = jax.random.split(sub_key, 3)
+            sample_key, mirror_key, critic_key, actor_key = jax.random.split(sub_key, 4)
             batch = replay_buffer.sample(replay, sample_key, self.sizes.batch_size)
+            batch = _either(mirror_key, batch, self.task.mirror(batch))
             sac, info = self.sac.update_critic(sac, batch, critic_key, self.hyper)
         sac, actor_info = self.sac.update_actor(sac, batch.observation, actor_key, self.hyper)
         return sac, {**info, **actor_info}
@@ -177,6 +178,12 @@ class Trainer:
         lives = jax.vmap(self.task.reset)(jax.random.split(reset_key, self.sizes.num_envs))
         info = jax.lax.scan(step, lives, jax.random.split(key, EVALUATION_STEPS))[1]
         return jax.tree.map(jnp.mean, info)
+
+
+def _either(key: jax.Array, batch: Batch, other: Batch) -> Batch:
+    """Each row from ``batch`` or, as likely, from ``other``."""
+    takes = jax.random.bernoulli(key, shape=batch.reward.shape)
+    return jax.tree.map(lambda a, b: jnp.where(takes.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, other)
 
 
 class Training:
