@@ -39,6 +39,7 @@ _OVERRIDE = 1.5  # what is learned can turn the heading to anywhere
 # The humanoid's angular velocities run to 10 rad/s and more.
 _SPIN_SCALE = 0.25  # of the root
 _SWING_SCALE = 0.1  # of the joints
+_RISING_SPAN = 2.0  # rad
 
 
 class Policy(Protocol):
@@ -123,6 +124,11 @@ def humanoid_joints(qpos: jax.Array, target: jax.Array) -> jax.Array:
     """
     angles = qpos[..., 7:][..., HUMANOID_ACTUATED]
     return jnp.clip(target - angles, -1.0, 1.0)
+
+
+def rising_joints(qpos: jax.Array, action: jax.Array) -> jax.Array:
+    """Torques[..., 21] of one that gets up: ``humanoid_joints`` with targets as far off as crouching needs."""
+    return humanoid_joints(qpos, _RISING_SPAN * action)
 
 
 def dribbler_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:

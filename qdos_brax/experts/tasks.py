@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from envs import models
+from envs.locomotion import dropped_humanoid, dropped_poses
 from envs.physics.base import PipelineState
 from envs.physics.mujoco_engine import MujocoEngine
 from qdos_brax.experts import policies, symmetry
@@ -250,11 +251,70 @@ class HumanoidWalking:
 
     def mirror(self, batch: Batch) -> Batch:
         """Left and right exchanged: the body is symmetric, the reward as well."""
-        return batch._replace(
-            observation=symmetry.mirrored_view(batch.observation),
-            action=symmetry.mirrored_action(batch.action),
-            next_observation=symmetry.mirrored_view(batch.next_observation),
+        return _mirrored(batch)
+
+
+class HumanoidRising:
+    """Up from wherever it fell, and stand.
+
+    Reward per control step: height of the torso as a share of the standing one, half as much again for being
+    upright there; one while it is up, less the more it moves then; less for effort. A life begins as OGBench's resets
+    do, dropped in a random pose, or (one in STANDING_SHARE) on its feet and pushed; it never ends early, so that lying
+    costs.
+    """
+
+    name = "humanoid_riser"
+    observation_dim, action_dim = 55, 21
+    discount, life_steps, turn_every = 0.99, 300, 10**9
+
+    STANDING_SHARE = 0.25
+    PUSH = 0.5  # standard deviation of the velocities at a start on its feet, m/s and rad/s
+
+    def __init__(self) -> None:
+        self.engine = MujocoEngine(models.humanoid_model(), threads=1)
+        self._poses = dropped_poses()
+
+    def reset(self, key: jax.Array) -> Life:
+        """See the class; the direction is of no matter here."""
+        kind_key, drop_key, pose_key, qvel_key, direction_key = jax.random.split(key, 5)
+        stands = jax.random.bernoulli(kind_key, self.STANDING_SHARE)
+        dropped = jnp.concatenate([jnp.zeros(2), dropped_humanoid(drop_key, self._poses)])
+        direction = random_direction(direction_key)
+        standing, _ = standing_humanoid(pose_key, jnp.arctan2(direction[1], direction[0]))
+        qvel = jnp.where(stands, self.PUSH, 0.1) * jax.random.normal(qvel_key, (self.engine.nv,))
+        pipeline = self.engine.init(jnp.where(stands, standing, dropped), qvel)
+        return Life(pipeline, direction, jnp.zeros((), jnp.int32))
+
+    def observe(self, life: Life) -> jax.Array:
+        """The body's view."""
+        return policies.humanoid_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
+
+    def joints(self, life: Life, action: jax.Array) -> jax.Array:
+        """Springs to where the action says."""
+        return policies.rising_joints(life.pipeline.qpos, action)
+
+    def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
+        """See the class."""
+        height = jnp.clip(after.qpos[2] / HumanoidWalking.STANDING, 0.0, 1.0)
+        is_up = humanoid_is_up(after.qpos)
+        calm = jnp.exp(-jnp.sum(after.qvel[:2] ** 2))
+        reward = (
+            height + 0.5 * height * jnp.maximum(uprightness(after.qpos), 0.0) + is_up * calm - 0.1 * jnp.mean(joints**2)
         )
+        ends = jnp.zeros((), bool)
+        return Verdict(reward, ~ends, ends, {"height": after.qpos[2], "up": is_up.astype(jnp.float32)})
+
+    def mirror(self, batch: Batch) -> Batch:
+        """Left and right exchanged."""
+        return _mirrored(batch)
+
+
+def _mirrored(batch: Batch) -> Batch:
+    return batch._replace(
+        observation=symmetry.mirrored_view(batch.observation),
+        action=symmetry.mirrored_action(batch.action),
+        next_observation=symmetry.mirrored_view(batch.next_observation),
+    )
 
 
 def standing_humanoid(key: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -268,4 +328,4 @@ def humanoid_is_up(qpos: jax.Array) -> jax.Array:
     return (qpos[..., 2] > 0.9) & (uprightness(qpos) > 0.5)
 
 
-TASKS: dict[str, Callable[[], Task]] = {task.name: task for task in (AntWalking, AntDribbling, HumanoidWalking)}
+TASKS: dict[str, Callable[[], Task]] = {task.name: task for task in (AntWalking, AntDribbling, HumanoidWalking, HumanoidRising)}

@@ -12,7 +12,7 @@ import pytest
 from envs.physics.base import PipelineState
 from qdos_brax.errors import UserError
 from qdos_brax.experts import policies, symmetry
-from qdos_brax.experts.tasks import TASKS, HumanoidWalking, Life, Verdict
+from qdos_brax.experts.tasks import TASKS, HumanoidRising, HumanoidWalking, Life, Verdict
 from qdos_brax.experts.train import Sizes, Trainer, Training, read_learner
 from qdos_brax.experts.views import random_direction, turned
 from qdos_brax.high_level.sac import Batch
@@ -140,6 +140,20 @@ def test_rewards_of_the_humanoid_by_hand() -> None:
     np.testing.assert_allclose(verdict.reward, 0.5 + 0.5 + 0.2 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
     assert verdict.alive
     assert not task.judge(before, jnp.zeros(21), life.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
+
+
+def test_rewards_of_rising_by_hand() -> None:
+    task = HumanoidRising()
+    life = task.reset(jax.random.key(0))
+    up = life.pipeline.qpos.at[2].set(1.2).at[3:7].set(jnp.array([1.0, 0, 0, 0]))
+    after = life.pipeline.replace(qpos=up, qvel=jnp.zeros(27).at[0].set(0.5))
+    verdict = task.judge(life, jnp.full(21, 0.5), after)
+    np.testing.assert_allclose(verdict.reward, 1.5 * 1.2 / 1.29 + np.exp(-0.25) - 0.1 * 0.25, atol=1e-5)
+    half = jnp.sqrt(0.5)
+    lying = life.pipeline.replace(qpos=up.at[2].set(0.129).at[3:7].set(jnp.array([half, half, 0, 0])))
+    verdict = task.judge(life, jnp.zeros(21), lying)
+    np.testing.assert_allclose(verdict.reward, 0.1, atol=1e-5)
+    assert verdict.alive and not verdict.lost
 
 
 def test_a_mirrored_humanoid_moves_as_its_image() -> None:
