@@ -298,17 +298,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--learner", type=Path, help="start from this learner, with an empty replay")
     parser.add_argument("--width", type=int, default=256, help="of the two hidden layers of every network")
+    parser.add_argument("--batch-size", type=int, default=256, help="rows per update")
+    parser.add_argument("--updates-per-step", type=int, default=16, help="critic updates per step of all environments")
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    command = (
-        f"python -m qdos_brax.experts.train {args.expert} --steps {args.steps} --seed {args.seed} --width {args.width}"
-    )
-    if args.learner is not None:
-        command += f" --learner {args.learner.name}"
-    training = Training(
-        Trainer(TASKS[args.expert](), Sizes(hidden=(args.width,) * 2)), args.out, args.seed, args.learner
-    )
-    training.run(args.steps, command)
+    sizes = Sizes(hidden=(args.width,) * 2, batch_size=args.batch_size, updates_per_step=args.updates_per_step)
+    training = Training(Trainer(TASKS[args.expert](), sizes), args.out, args.seed, args.learner)
+    told = {**vars(args), "learner": args.learner and args.learner.name}
+    names = ("steps", "seed", "learner", "width", "batch_size", "updates_per_step")
+    flags = [f"--{name.replace('_', '-')} {told[name]}" for name in names if told[name] is not None]
+    training.run(args.steps, " ".join(["python -m qdos_brax.experts.train", args.expert, *flags]))
 
 
 if __name__ == "__main__":
