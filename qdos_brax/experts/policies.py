@@ -40,6 +40,7 @@ _OVERRIDE = 1.5  # what is learned can turn the heading to anywhere
 _SPIN_SCALE = 0.25  # of the root
 _SWING_SCALE = 0.1  # of the joints
 _RISING_SPAN = 2.0  # rad
+_SHARPEST = 0.7  # rad
 
 
 class Policy(Protocol):
@@ -110,9 +111,21 @@ class HumanoidWalker:
         return humanoid_joints(qpos, self.actor.mode(humanoid_view(qpos, qvel, direction)))
 
 
+def humanoid_heading(qpos: jax.Array, direction: jax.Array) -> jax.Array:
+    """The unit vector[..., 2] nearest to ``direction[..., 2]`` that is at most _SHARPEST from where the body faces.
+
+    What lies behind is turned to in a curve: a body that has to change its course at once falls.
+    """
+    ahead = jnp.stack([jnp.ones_like(qpos[..., 0]), jnp.zeros_like(qpos[..., 0])], axis=-1)
+    facing = unit_vector(body_view(qpos, jnp.zeros_like(qpos[..., 1:]), ahead)[..., 1:3])
+    seen = turned(direction, facing)
+    angle = jnp.clip(jnp.arctan2(seen[..., 1], seen[..., 0]), -_SHARPEST, _SHARPEST)
+    return turned(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), facing * jnp.array([1.0, -1.0]))
+
+
 def humanoid_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
-    """[..., 55]: the body's view, its fast numbers scaled to be about one."""
-    view = body_view(qpos, qvel, direction)
+    """[..., 55]: the body's view along its heading, its fast numbers scaled to be about one."""
+    view = body_view(qpos, qvel, humanoid_heading(qpos, direction))
     still, spin, swing = jnp.split(view, [31, 34], axis=-1)
     return jnp.concatenate([still, spin * _SPIN_SCALE, swing * _SWING_SCALE], axis=-1)
 
