@@ -16,6 +16,8 @@ from envs.models import humanoid_model
 from envs.physics import PipelineState
 from envs.task import RESET_NOISE, TaskEnv
 
+DROP_HEIGHT = 1.5  # m
+
 START_POSES = 4096
 """How many joint configurations the humanoid's resets are drawn from."""
 
@@ -61,7 +63,7 @@ class HumanoidMaze(BodyEnv):
 
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         super().__init__(spec, physics)
-        self._start_poses = _start_poses()
+        self._start_poses = dropped_poses()
 
     def observe(self, pipeline_state: PipelineState) -> jax.Array:
         """float32[69], see above."""
@@ -69,15 +71,20 @@ class HumanoidMaze(BodyEnv):
         return jnp.concatenate([qpos[:2], qpos[7:], pipeline_state.sensed, pipeline_state.qvel])
 
     def _start_pose(self, qpos_key: jax.Array, qvel_key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        turn_key, angles_key = jax.random.split(qpos_key)
-        quat = jax.random.uniform(turn_key, (4,))  # OGBench's: no component is ever negative
-        angles = jax.random.choice(angles_key, jnp.asarray(self._start_poses))
-        qpos = jnp.concatenate([jnp.asarray(self._init_qpos[:3]), quat / jnp.linalg.norm(quat), angles])
+        qpos = jnp.concatenate([jnp.asarray(self._init_qpos[:2]), dropped_humanoid(qpos_key, self._start_poses)])
         return qpos, RESET_NOISE * jax.random.normal(qvel_key, (self.engine.nv,))
 
 
+def dropped_humanoid(key: jax.Array, poses: np.ndarray) -> jax.Array:
+    """Height, quaternion and joint angles[26] of a humanoid let fall, its angles drawn from ``poses[n, 21]``."""
+    turn_key, angles_key = jax.random.split(key)
+    quat = jax.random.uniform(turn_key, (4,))  # OGBench's: no component is ever negative
+    angles = jax.random.choice(angles_key, jnp.asarray(poses))
+    return jnp.concatenate([jnp.array([DROP_HEIGHT]), quat / jnp.linalg.norm(quat), angles])
+
+
 @cache
-def _start_poses() -> np.ndarray:
+def dropped_poses() -> np.ndarray:
     """float32[START_POSES, 21]: joint angles, uniform in their ranges, in which no two parts of the humanoid touch.
 
     At a height of 1.5 it touches nothing else, whichever way it is turned.

@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 
 from envs.physics.base import PipelineState
+from envs.render import steps_per_second
 from envs.soccer import BALL_QPOS
 from envs.task import GOAL_TOLERANCE, START_NOISE, TaskEnv
 from qdos_brax.data.quality import QUALITY
@@ -31,18 +32,19 @@ RECIPE = 3
 """Version of what is collected; part of the cache's file names, as are the experts' weights."""
 
 HEAVY_NOISE = 1.0  # standard deviation of action noise in noisy episodes
-WANDER_STEPS = 30  # mean steps between two draws of a wanderer's direction, where the recipe does not say
+WANDER_SECONDS = 3.0  # mean time between two draws of a wanderer's direction, where the recipe does not say
 CHUNK_STEPS = 50  # steps per call of the jitted program; the episode length is a multiple of it
 SHORTEST_EPISODE = 200
 
-# The stuck rule: looked at every CHECK_STEPS; a stuck ant walks to somewhere else for ESCAPE_STEPS, with a new goal.
-CHECK_STEPS = 60
-ESCAPE_STEPS = 30
-STUCK_MOVE = 0.5  # m within CHECK_STEPS, of the ant, or of a ball it is at
+# The stuck rule: looked at every CHECK_SECONDS; a stuck body walks to somewhere else for ESCAPE_SECONDS, with a new
+# goal.
+CHECK_SECONDS = 6.0
+ESCAPE_SECONDS = 3.0
+STUCK_MOVE = 0.5  # m within CHECK_SECONDS, of the body, or of a ball it is at
 AT_BALL = 2.0  # m
 DRIBBLE_REACH = 3.0  # m from the ball at which the dribbler takes over
 WITH_BALL = 0.5  # share of soccer's short episodes (stitch) that have anything to do with the ball
-PATIENCE = 200  # steps after which a failing attempt turns round in any case
+PATIENCE_SECONDS = 20.0  # after which a failing attempt turns round in any case
 
 
 Row = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
@@ -182,6 +184,9 @@ class Collector:
         self.dribbler = policy if isinstance(policy, policies.Dribbles) else None
         self.walker = policy.walker if isinstance(policy, policies.Dribbles) else policy
         self.navigator = Navigator(env.layout)
+        rate = steps_per_second(env)
+        self.check_steps, self.escape_steps = round(CHECK_SECONDS * rate), round(ESCAPE_SECONDS * rate)
+        self.wander_steps, self.patience = round(WANDER_SECONDS * rate), round(PATIENCE_SECONDS * rate)
 
     def episodes(
         self, key: jax.Array, kinds: np.ndarray, length: int, progress: Callable[[int], None] | None = None
@@ -309,16 +314,16 @@ class Collector:
         body, cargo = self._positions(lane.pipeline.qpos, lane.has_ball)
         gap = jnp.linalg.norm(cargo - lane.goal_xy)
         half_way = gap < 0.5 * jnp.linalg.norm(lane.origin_xy - lane.goal_xy)
-        impatient = lane.attempt >= PATIENCE
+        impatient = lane.attempt >= self.patience
         turns = (kind == QUALITY["fail"]) & ~lane.turned & (half_way | impatient)
         undone = lane.turned & ((jnp.linalg.norm(cargo - lane.origin_xy) < 2 * GOAL_TOLERANCE) | impatient)
 
-        checks = (lane.clock % CHECK_STEPS == 0) & (lane.clock > 0)
+        checks = (lane.clock % self.check_steps == 0) & (lane.clock > 0)
         stuck = checks & self._is_stuck(lane, body, cargo)
         arrived = ~lane.turned & (gap < GOAL_TOLERANCE)
         redraw = undone | stuck | arrived if self.recipe.goal_cells is None else jnp.zeros((), bool)
         if self.recipe.heading_steps is None:
-            heads_anew = jax.random.uniform(turn_key) < 1 / WANDER_STEPS
+            heads_anew = jax.random.uniform(turn_key) < 1 / self.wander_steps
         else:
             heads_anew = lane.clock % self.recipe.heading_steps == 0
         return lane.replace(
@@ -328,7 +333,7 @@ class Collector:
             attempt=jnp.where(redraw | turns, 0, lane.attempt),
             heading=jnp.where(heads_anew, random_direction(heading_key), lane.heading),
             away_xy=jnp.where(stuck, self.navigator.random_free_xy(away_key), lane.away_xy),
-            escape=jnp.where(stuck, ESCAPE_STEPS, lane.escape),
+            escape=jnp.where(stuck, self.escape_steps, lane.escape),
             arrivals=lane.arrivals + (arrived & redraw),
             seen_body=jnp.where(checks, body, lane.seen_body),
             seen_cargo=jnp.where(checks, cargo, lane.seen_cargo),

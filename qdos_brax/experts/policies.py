@@ -19,6 +19,7 @@ import numpy as np
 from flax import traverse_util
 
 from qdos_brax.errors import UserError
+from qdos_brax.experts.symmetry import HUMANOID_ACTUATED
 from qdos_brax.experts.views import ANT_NQ, ANT_NV, ball_view, body_view, turned, unit_vector
 from qdos_brax.networks import DiagonalGaussian
 from qdos_brax.runs.folder import replacing
@@ -33,6 +34,13 @@ _LANE = 0.5  # half width of the lane behind the ball in which it pushes
 _FUNNEL = 0.75  # the lane widens by this much per m behind the ball
 _STEER = 2.0  # turn of the push per m of lateral offset
 _OVERRIDE = 1.5  # what is learned can turn the heading to anywhere
+
+
+# The humanoid's angular velocities run to 10 rad/s and more.
+_SPIN_SCALE = 0.25  # of the root
+_SWING_SCALE = 0.1  # of the joints
+_RISING_SPAN = 2.0  # rad
+_SHARPEST = 0.7  # rad
 
 
 class Policy(Protocol):
@@ -73,20 +81,67 @@ class Actor:
         return jnp.tanh(DiagonalGaussian(self.hidden, self.dim).apply(self.params, observation)[0])
 
 
-class Walker:
-    """Walks along the direction; qpos and qvel may go on behind the body's own.
+class AntWalker:
+    """Walks the ant along the direction; qpos and qvel may go on behind the ant's own.
 
     Args:
         actor: what was trained.
-        nq: numbers in the body's qpos; its qvel has one less.
     """
 
-    def __init__(self, actor: Actor, nq: int) -> None:
-        self.actor, self.nq, self.params = actor, nq, actor.params
+    def __init__(self, actor: Actor) -> None:
+        self.actor, self.params = actor, actor.params
 
     def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
         """See ``Policy.act``."""
-        return self.actor.mode(body_view(qpos[..., : self.nq], qvel[..., : self.nq - 1], direction))
+        return self.actor.mode(body_view(qpos[..., :ANT_NQ], qvel[..., :ANT_NV], direction))
+
+
+class HumanoidWalker:
+    """Walks the humanoid along the direction.
+
+    Args:
+        actor: what was trained.
+    """
+
+    def __init__(self, actor: Actor) -> None:
+        self.actor, self.params = actor, actor.params
+
+    def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+        """See ``Policy.act``."""
+        return humanoid_joints(qpos, self.actor.mode(humanoid_view(qpos, qvel, direction)))
+
+
+def humanoid_heading(qpos: jax.Array, direction: jax.Array) -> jax.Array:
+    """The unit vector[..., 2] nearest to ``direction[..., 2]`` that is at most _SHARPEST from where the body faces.
+
+    What lies behind is turned to in a curve: a body that has to change its course at once falls.
+    """
+    ahead = jnp.stack([jnp.ones_like(qpos[..., 0]), jnp.zeros_like(qpos[..., 0])], axis=-1)
+    facing = unit_vector(body_view(qpos, jnp.zeros_like(qpos[..., 1:]), ahead)[..., 1:3])
+    seen = turned(direction, facing)
+    angle = jnp.clip(jnp.arctan2(seen[..., 1], seen[..., 0]), -_SHARPEST, _SHARPEST)
+    return turned(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), facing * jnp.array([1.0, -1.0]))
+
+
+def humanoid_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+    """[..., 55]: the body's view along its heading, its fast numbers scaled to be about one."""
+    view = body_view(qpos, qvel, humanoid_heading(qpos, direction))
+    still, spin, swing = jnp.split(view, [31, 34], axis=-1)
+    return jnp.concatenate([still, spin * _SPIN_SCALE, swing * _SWING_SCALE], axis=-1)
+
+
+def humanoid_joints(qpos: jax.Array, target: jax.Array) -> jax.Array:
+    """Torques[..., 21], as shares of the motors' own, that pull each joint to its ``target[..., 21]`` in rad.
+
+    Full torque at one rad off, so that a target of zero stands for a while where zero torque falls at once.
+    """
+    angles = qpos[..., 7:][..., HUMANOID_ACTUATED]
+    return jnp.clip(target - angles, -1.0, 1.0)
+
+
+def rising_joints(qpos: jax.Array, action: jax.Array) -> jax.Array:
+    """Torques[..., 21] of one that gets up: ``humanoid_joints`` with targets as far off as crouching needs."""
+    return humanoid_joints(qpos, _RISING_SPAN * action)
 
 
 def dribbler_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
@@ -143,9 +198,14 @@ class Dribbler:
         return dribbler_joints(self.walker, qpos, qvel, direction, command)
 
 
-def ant_walker(path: Path | None = None) -> Walker:
+def ant_walker(path: Path | None = None) -> AntWalker:
     """The walking ant, shipped or in ``path``; errors as ``read_actor``."""
-    return Walker(read_actor(path or shipped("ant_walker")), ANT_NQ)
+    return AntWalker(read_actor(path or shipped("ant_walker")))
+
+
+def humanoid_walker(path: Path | None = None) -> HumanoidWalker:
+    """The walking humanoid, shipped or in ``path``; errors as ``read_actor``."""
+    return HumanoidWalker(read_actor(path or shipped("humanoid_walker")))
 
 
 def ant_dribbler(path: Path | None = None) -> Dribbler:

@@ -13,10 +13,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from envs import models
+from envs.locomotion import dropped_humanoid, dropped_poses
 from envs.physics.base import PipelineState
 from envs.physics.mujoco_engine import MujocoEngine
-from qdos_brax.experts import policies
+from qdos_brax.experts import policies, symmetry
 from qdos_brax.experts.views import ANT_NQ, ANT_NV, body_view, random_direction, turned, uprightness
+from qdos_brax.high_level.sac import Batch
 
 
 class Life(struct.PyTreeNode):
@@ -85,6 +87,10 @@ class Task(Protocol):
         """The step from ``before`` to ``after`` under ``joints``."""
         ...
 
+    def mirror(self, batch: Batch) -> Batch:
+        """The same transitions as a mirror shows them, or ``batch`` itself for a body that is learned as it is."""
+        ...
+
 
 class AntWalking:
     """Reward: ten times the metres along the direction (OGBench's recipe); falling ends it."""
@@ -116,6 +122,10 @@ class AntWalking:
         """See the class."""
         speed = (after.qpos[:2] - before.pipeline.qpos[:2]) @ before.direction
         return Verdict(10.0 * speed, ant_is_up(after.qpos), jnp.zeros((), bool), {"speed": speed})
+
+    def mirror(self, batch: Batch) -> Batch:
+        """The batch itself."""
+        return batch
 
 
 class AntDribbling:
@@ -176,6 +186,10 @@ class AntDribbling:
         measures = {"speed": way[0], "aside": jnp.abs(way[1]), "gap": gap}
         return Verdict(reward, ant_is_up(after.qpos), gap > self.LOST, measures)
 
+    def mirror(self, batch: Batch) -> Batch:
+        """The batch itself."""
+        return batch
+
 
 def ant_is_up(qpos: jax.Array) -> jax.Array:
     """bool[...]: the torso's height is within [0.2, 1.0] m and its own z axis points up."""
@@ -185,16 +199,17 @@ def ant_is_up(qpos: jax.Array) -> jax.Array:
 class HumanoidWalking:
     """Upright and along the direction, 40 control steps per second.
 
-    Reward per control step: speed along the direction, up to PACE, as a share of it; half as much for being up;
-    facing the way; less for speed aside and for effort. Falling ends it. The direction is at first nearly where the
-    body faces, and now and then another.
+    Reward per control step: for speed along the heading (``policies.humanoid_heading``) most, a parabola that is 0 for
+    none and 2 at PACE (beyond it, it would run, and fall); for being up and facing the way a quarter of that (with
+    more, it stands still and is content); less for speed aside and for effort. Falling ends it. The direction is at
+    first nearly where the body faces, and now and then another.
     """
 
     name = "humanoid_walker"
     observation_dim, action_dim = 55, 21
     discount, life_steps, turn_every = 0.99, 1000, 400
 
-    PACE = 1.6  # m/s
+    PACE = 1.2  # m/s
     STANDING = 1.29  # m, height of the torso
 
     def __init__(self) -> None:
@@ -213,19 +228,20 @@ class HumanoidWalking:
 
     def observe(self, life: Life) -> jax.Array:
         """The body's view."""
-        return body_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
+        return policies.humanoid_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
 
     def joints(self, life: Life, action: jax.Array) -> jax.Array:
-        """The action itself."""
-        return action
+        """Springs to where the action says."""
+        return policies.humanoid_joints(life.pipeline.qpos, action)
 
     def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
         """See the class."""
-        velocity = turned(after.qpos[:2] - before.pipeline.qpos[:2], before.direction) / self._seconds
+        heading = policies.humanoid_heading(before.pipeline.qpos, before.direction)
+        velocity = turned(after.qpos[:2] - before.pipeline.qpos[:2], heading) / self._seconds
         facing = body_view(after.qpos, after.qvel, before.direction)[1]
         reward = (
-            jnp.clip(velocity[0], -self.PACE, self.PACE) / self.PACE
-            + 0.5 * uprightness(after.qpos)
+            2.0 * jnp.maximum(1.0 - (velocity[0] / self.PACE - 1.0) ** 2, -1.0)
+            + 0.3 * uprightness(after.qpos)
             + 0.2 * facing
             - 0.2 * jnp.minimum(jnp.abs(velocity[1]), self.PACE)
             - 0.1 * jnp.mean(joints**2)
@@ -233,6 +249,73 @@ class HumanoidWalking:
         return Verdict(
             reward, humanoid_is_up(after.qpos), jnp.zeros((), bool), {"speed": velocity[0], "facing": facing}
         )
+
+    def mirror(self, batch: Batch) -> Batch:
+        """Left and right exchanged: the body is symmetric, the reward as well."""
+        return _mirrored(batch)
+
+
+class HumanoidRising:
+    """Up from wherever it fell, and stand.
+
+    Reward per control step: height of the torso as a share of the standing one, half as much again for being
+    upright there; one while it is up, less the more it moves then; less for effort. A life begins as OGBench's resets
+    do, dropped in a random pose, or (one in STANDING_SHARE) on its feet and pushed; it never ends early, so that lying
+    costs.
+    """
+
+    name = "humanoid_riser"
+    observation_dim, action_dim = 55, 21
+    discount, life_steps, turn_every = 0.99, 300, 10**9
+
+    STANDING_SHARE = 0.25
+    PUSH = 0.5  # standard deviation of the velocities at a start on its feet, m/s and rad/s
+
+    def __init__(self) -> None:
+        self.engine = MujocoEngine(models.humanoid_model(), threads=1)
+        self._poses = dropped_poses()
+
+    def reset(self, key: jax.Array) -> Life:
+        """See the class; the direction is of no matter here."""
+        kind_key, drop_key, pose_key, qvel_key, direction_key = jax.random.split(key, 5)
+        stands = jax.random.bernoulli(kind_key, self.STANDING_SHARE)
+        dropped = jnp.concatenate([jnp.zeros(2), dropped_humanoid(drop_key, self._poses)])
+        direction = random_direction(direction_key)
+        standing, _ = standing_humanoid(pose_key, jnp.arctan2(direction[1], direction[0]))
+        qvel = jnp.where(stands, self.PUSH, 0.1) * jax.random.normal(qvel_key, (self.engine.nv,))
+        pipeline = self.engine.init(jnp.where(stands, standing, dropped), qvel)
+        return Life(pipeline, direction, jnp.zeros((), jnp.int32))
+
+    def observe(self, life: Life) -> jax.Array:
+        """The body's view."""
+        return policies.humanoid_view(life.pipeline.qpos, life.pipeline.qvel, life.direction)
+
+    def joints(self, life: Life, action: jax.Array) -> jax.Array:
+        """Springs to where the action says."""
+        return policies.rising_joints(life.pipeline.qpos, action)
+
+    def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
+        """See the class."""
+        height = jnp.clip(after.qpos[2] / HumanoidWalking.STANDING, 0.0, 1.0)
+        is_up = humanoid_is_up(after.qpos)
+        calm = jnp.exp(-jnp.sum(after.qvel[:2] ** 2))
+        reward = (
+            height + 0.5 * height * jnp.maximum(uprightness(after.qpos), 0.0) + is_up * calm - 0.1 * jnp.mean(joints**2)
+        )
+        ends = jnp.zeros((), bool)
+        return Verdict(reward, ~ends, ends, {"height": after.qpos[2], "up": is_up.astype(jnp.float32)})
+
+    def mirror(self, batch: Batch) -> Batch:
+        """Left and right exchanged."""
+        return _mirrored(batch)
+
+
+def _mirrored(batch: Batch) -> Batch:
+    return batch._replace(
+        observation=symmetry.mirrored_view(batch.observation),
+        action=symmetry.mirrored_action(batch.action),
+        next_observation=symmetry.mirrored_view(batch.next_observation),
+    )
 
 
 def standing_humanoid(key: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -246,4 +329,6 @@ def humanoid_is_up(qpos: jax.Array) -> jax.Array:
     return (qpos[..., 2] > 0.9) & (uprightness(qpos) > 0.5)
 
 
-TASKS: dict[str, Callable[[], Task]] = {task.name: task for task in (AntWalking, AntDribbling, HumanoidWalking)}
+TASKS: dict[str, Callable[[], Task]] = {
+    task.name: task for task in (AntWalking, AntDribbling, HumanoidWalking, HumanoidRising)
+}

@@ -158,8 +158,9 @@ class Trainer:
         """``actor_every`` critic updates and one of the actor."""
         info: dict[str, jax.Array] = {}
         for sub_key in jax.random.split(key, self.sizes.actor_every):
-            sample_key, critic_key, actor_key = jax.random.split(sub_key, 3)
+            sample_key, mirror_key, critic_key, actor_key = jax.random.split(sub_key, 4)
             batch = replay_buffer.sample(replay, sample_key, self.sizes.batch_size)
+            batch = _either(mirror_key, batch, self.task.mirror(batch))
             sac, info = self.sac.update_critic(sac, batch, critic_key, self.hyper)
         sac, actor_info = self.sac.update_actor(sac, batch.observation, actor_key, self.hyper)
         return sac, {**info, **actor_info}
@@ -177,6 +178,12 @@ class Trainer:
         lives = jax.vmap(self.task.reset)(jax.random.split(reset_key, self.sizes.num_envs))
         info = jax.lax.scan(step, lives, jax.random.split(key, EVALUATION_STEPS))[1]
         return jax.tree.map(jnp.mean, info)
+
+
+def _either(key: jax.Array, batch: Batch, other: Batch) -> Batch:
+    """Each row from ``batch`` or, as likely, from ``other``."""
+    takes = jax.random.bernoulli(key, shape=batch.reward.shape)
+    return jax.tree.map(lambda a, b: jnp.where(takes.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, other)
 
 
 class Training:
@@ -291,17 +298,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--learner", type=Path, help="start from this learner, with an empty replay")
     parser.add_argument("--width", type=int, default=256, help="of the two hidden layers of every network")
+    parser.add_argument("--batch-size", type=int, default=256, help="rows per update")
+    parser.add_argument("--updates-per-step", type=int, default=16, help="critic updates per step of all environments")
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    command = (
-        f"python -m qdos_brax.experts.train {args.expert} --steps {args.steps} --seed {args.seed} --width {args.width}"
-    )
-    if args.learner is not None:
-        command += f" --learner {args.learner.name}"
-    training = Training(
-        Trainer(TASKS[args.expert](), Sizes(hidden=(args.width,) * 2)), args.out, args.seed, args.learner
-    )
-    training.run(args.steps, command)
+    sizes = Sizes(hidden=(args.width,) * 2, batch_size=args.batch_size, updates_per_step=args.updates_per_step)
+    training = Training(Trainer(TASKS[args.expert](), sizes), args.out, args.seed, args.learner)
+    told = {**vars(args), "learner": args.learner and args.learner.name}
+    names = ("steps", "seed", "learner", "width", "batch_size", "updates_per_step")
+    flags = [f"--{name.replace('_', '-')} {told[name]}" for name in names if told[name] is not None]
+    training.run(args.steps, " ".join(["python -m qdos_brax.experts.train", args.expert, *flags]))
 
 
 if __name__ == "__main__":

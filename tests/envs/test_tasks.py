@@ -92,7 +92,7 @@ def test_reset_noise_is_ogbenchs() -> None:
 def test_humanoid_starts_as_ogbench_lets_it() -> None:
     env = envs.make("humanoidmaze-medium", physics="mujoco")
     model, data = env.engine.model, mujoco.MjData(env.engine.model)
-    poses = locomotion._start_poses()
+    poses = locomotion.dropped_poses()
     low, high = model.jnt_range[1:].T
     assert poses.shape == (4096, 21) and (poses >= low - 1e-6).all() and (poses <= high + 1e-6).all()
     # the rejected quarter folds arms into the body; the ankles know nothing of that and stay uniform

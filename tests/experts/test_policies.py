@@ -55,6 +55,16 @@ def test_forward_and_up_of_a_known_pose() -> None:
     np.testing.assert_allclose(view[1:4], [0, 1, 0], atol=1e-6)
 
 
+@pytest.mark.parametrize(("off", "taken"), [(0.3, 0.3), (-0.3, -0.3), (2.5, 0.7), (-3.0, -0.7)])
+def test_the_humanoid_turns_in_a_curve(off: float, taken: float) -> None:
+    yaw = 2.0  # where it faces, leaning forward by 0.4
+    turn, lean = np.array([np.cos(1.0), 0, 0, np.sin(1.0)]), np.array([np.cos(0.2), 0, np.sin(0.2), 0])
+    quat = [turn[0] * lean[0], -turn[3] * lean[2], turn[0] * lean[2], turn[3] * lean[0]]  # first the lean
+    qpos = jnp.zeros(28).at[3:7].set(jnp.array(quat))
+    heading = policies.humanoid_heading(qpos, jnp.array([np.cos(yaw + off), np.sin(yaw + off)]))
+    np.testing.assert_allclose(heading, [np.cos(yaw + taken), np.sin(yaw + taken)], atol=1e-5)
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_in_front_of_the_ball_it_goes_round_it(side: float) -> None:
     at = jnp.array([1.0, 0.1 * side])

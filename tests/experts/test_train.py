@@ -11,10 +11,11 @@ import pytest
 
 from envs.physics.base import PipelineState
 from qdos_brax.errors import UserError
-from qdos_brax.experts import policies
-from qdos_brax.experts.tasks import TASKS, HumanoidWalking, Life, Verdict
+from qdos_brax.experts import policies, symmetry
+from qdos_brax.experts.tasks import TASKS, HumanoidRising, HumanoidWalking, Life, Verdict
 from qdos_brax.experts.train import Sizes, Trainer, Training, read_learner
 from qdos_brax.experts.views import random_direction, turned
+from qdos_brax.high_level.sac import Batch
 
 SIZES = Sizes(
     num_envs=8, updates_per_step=8, batch_size=64, hidden=(64, 64), capacity=2000, random_steps=400, steps_per_chunk=25
@@ -46,6 +47,9 @@ class Going:
 
     def observe(self, life: Life) -> jax.Array:
         return turned(life.pipeline.qpos, life.direction)
+
+    def mirror(self, batch: Batch) -> Batch:
+        return batch
 
     def joints(self, life: Life, action: jax.Array) -> jax.Array:
         return turned(action, life.direction * jnp.array([1.0, -1.0]))
@@ -131,8 +135,56 @@ def test_rewards_of_the_humanoid_by_hand() -> None:
     yaw = jnp.array([jnp.cos(jnp.pi / 4), 0.0, 0.0, jnp.sin(jnp.pi / 4)])  # faces +y
     qpos = life.pipeline.qpos.at[:2].set(0.0).at[3:7].set(yaw)
     before = life.replace(pipeline=life.pipeline.replace(qpos=qpos))
-    after = life.pipeline.replace(qpos=qpos.at[:2].set(jnp.array([0.01, 0.02])))  # 0.025 s: 0.4 m/s aside, 0.8 m/s on
+    after = life.pipeline.replace(qpos=qpos.at[:2].set(jnp.array([0.01, 0.015])))  # 0.025 s: 0.4 m/s aside, 0.6 m/s on
     verdict = task.judge(before, jnp.full(21, 0.5), after)
-    np.testing.assert_allclose(verdict.reward, 0.5 + 0.5 + 0.2 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
+    np.testing.assert_allclose(verdict.reward, 1.5 + 0.3 + 0.2 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
     assert verdict.alive
     assert not task.judge(before, jnp.zeros(21), life.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
+
+
+def test_rewards_of_rising_by_hand() -> None:
+    task = HumanoidRising()
+    life = task.reset(jax.random.key(0))
+    up = life.pipeline.qpos.at[2].set(1.2).at[3:7].set(jnp.array([1.0, 0, 0, 0]))
+    after = life.pipeline.replace(qpos=up, qvel=jnp.zeros(27).at[0].set(0.5))
+    verdict = task.judge(life, jnp.full(21, 0.5), after)
+    np.testing.assert_allclose(verdict.reward, 1.5 * 1.2 / 1.29 + np.exp(-0.25) - 0.1 * 0.25, atol=1e-5)
+    half = jnp.sqrt(0.5)
+    lying = life.pipeline.replace(qpos=up.at[2].set(0.129).at[3:7].set(jnp.array([half, half, 0, 0])))
+    verdict = task.judge(life, jnp.zeros(21), lying)
+    np.testing.assert_allclose(verdict.reward, 0.1, atol=1e-5)
+    assert verdict.alive and not verdict.lost
+
+
+def test_a_mirrored_humanoid_moves_as_its_image() -> None:
+    task = HumanoidWalking()
+    model, rng = task.engine.model, np.random.default_rng(0)
+    np.testing.assert_array_equal(symmetry.HUMANOID_ACTUATED, model.actuator_trnid[:, 0] - 1)
+    life = task.reset(jax.random.key(1)).replace(direction=jnp.array([1.0, 0.0]))
+    qpos = life.pipeline.qpos + jnp.asarray(rng.uniform(-0.2, 0.2, 28))
+    qvel = jnp.asarray(rng.normal(size=27))
+    action = jnp.asarray(rng.uniform(-1, 1, 21), jnp.float32)
+
+    def image(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        joints = symmetry.mirrored_view(jnp.zeros(55).at[7:28].set(qpos[7:]).at[34:].set(qvel[6:]))
+        place = qpos[:7] * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
+        speed = qvel[:6] * jnp.array([1.0, -1, 1, -1, 1, -1])
+        return jnp.concatenate([place, joints[7:28]]), jnp.concatenate([speed, joints[34:]])
+
+    here = life.replace(pipeline=task.engine.init(qpos, qvel))
+    there = life.replace(pipeline=task.engine.init(*image(qpos, qvel)))
+    row = Batch(task.observe(here), action, jnp.zeros(()), jnp.ones(()), task.observe(here))
+    seen = task.mirror(row)
+    np.testing.assert_allclose(task.observe(there), seen.observation, atol=1e-5)
+    torques = task.joints(here, action)
+    torques_there = task.joints(there, seen.action)
+    np.testing.assert_allclose(torques_there, symmetry.mirrored_action(torques), atol=1e-5)
+    assert not np.allclose(torques_there, torques, atol=0.1)
+    for _ in range(4):
+        here, there = (
+            life.replace(pipeline=task.engine.step(life.pipeline, joints))
+            for life, joints in ((here, torques), (there, torques_there))
+        )
+    expected = image(here.pipeline.qpos, here.pipeline.qvel)
+    np.testing.assert_allclose(there.pipeline.qpos, expected[0], atol=1e-4)
+    np.testing.assert_allclose(there.pipeline.qvel, expected[1], atol=1e-2)
