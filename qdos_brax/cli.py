@@ -73,7 +73,7 @@ def train_parser() -> Parser:
     parser.add_argument(
         "--physics",
         metavar="ENGINE",
-        help="auto, mjx or mujoco (default auto: MuJoCo C where there is only a CPU, MJX on an accelerator)",
+        help="auto, mjx, mjx-warp or mujoco (default auto: MuJoCo C where there is only a CPU, MJX on an accelerator)",
     )
     parser.add_argument("--steps", metavar="N", help="environment steps of the online phase")
     parser.add_argument("--pretrain-steps", metavar="N", help="gradient steps of the values and of the skills, each")
