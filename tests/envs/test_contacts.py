@@ -112,7 +112,7 @@ def test_limbs_and_limbs_equal_c(kind: str, size: str, kinds: tuple[Any, Any]) -
     ours, theirs = (our_contacts(model, kinds, first, c) for c in (COLLIDERS, collision_driver._COLLISION_FUNC))
     rng = np.random.default_rng(0)
     found, errors = 0, []
-    while found < 300:
+    while found < 150:
         pos = rng.uniform(-0.2, 0.2, 3).astype(np.float32)
         quat = rng.normal(size=4)
         quat /= np.linalg.norm(quat)
@@ -125,7 +125,7 @@ def test_limbs_and_limbs_equal_c(kind: str, size: str, kinds: tuple[Any, Any]) -
         np.testing.assert_allclose(at, expected, atol=5e-6, err_msg=f"{pos} {quat}")
         errors += list(np.abs(theirs(pos, quat) - expected).max(axis=1))
         found += len(expected)
-    assert np.median(errors) > 5e-6  # else MJX is mended upstream, and these two functions can go
+    assert np.quantile(errors, 0.9) > 2e-5  # else MJX is mended upstream, and these two functions can go
 
 
 def capsule_on_floor(angle: float) -> tuple[np.ndarray, SimpleNamespace, SimpleNamespace]:
