@@ -240,6 +240,7 @@ def _tasks(args: argparse.Namespace) -> int:
             for column, (text, width) in enumerate(zip(row, widths, strict=True))
         )
         print("  ".join(cells).rstrip())
+    print("\nmjx-warp runs on CUDA only; which engines run on this machine says: python -m qdos_brax doctor")
     return 0
 
 

@@ -12,6 +12,7 @@ import pytest
 
 import envs
 from envs.physics import why_not
+from qdos_brax import doctor
 
 
 def test_it_is_refused_with_what_mends_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,6 +31,18 @@ def test_it_is_refused_with_what_mends_it(monkeypatch: pytest.MonkeyPatch) -> No
     assert why_not("mjx-warp") == why_not("mjx") == why_not("mujoco") == ""
 
 
+def test_doctor_says_which_engines_run_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    passed, line = doctor._engines()  # a missing engine that nobody asked for is no fault
+    assert passed and line.startswith(
+        "engines: mjx, mujoco (auto); not mjx-warp: the package warp-lang is not installed"
+    )
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(jax, "devices", lambda platform: [object()])
+    assert doctor._engines() == (True, "engines: mjx, mjx-warp, mujoco (auto)")
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)  # Warp compiles some 50 kernels, one after the other
 def test_its_steps_on_a_cpu_are_near_cs() -> None:
@@ -44,7 +57,7 @@ def test_its_steps_on_a_cpu_are_near_cs() -> None:
     exact_step = jax.jit(jax.vmap(jax.vmap(env.engine.step)))
     start = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 8)).pipeline_state
     action = jax.random.uniform(jax.random.key(1), (2, 4, 8), minval=-1.0)
-    for lift, within in ((1.0, 2e-5), (-0.2, 2e-2)):  # 0.2 lower all touch the floor
+    for lift, within in ((1.0, 2e-5), (-0.3, 2e-2)):  # 0.3 lower all touch the floor
         qpos, qvel = (x.reshape(2, 4, -1) for x in (start.qpos.at[:, 2].add(lift), start.qvel))
         ends = []
         for one, stepper in ((engine, step), (env.engine, exact_step)):
@@ -53,8 +66,8 @@ def test_its_steps_on_a_cpu_are_near_cs() -> None:
         assert error.max() < within
         assert np.abs(np.asarray(ends[1].qpos) - qpos).max() > 0.05
 
-    # what does not fit is counted, and not passed over in silence
+    # what does not fit shows: room for the limits' 8 rows alone, and several legs on the floor, of 4 rows each
     cramped = MjxWarpEngine(body.near(True), env.layout, {3: 0}, body.places)
-    lowered = start.qpos.at[:, 2].add(-0.2)
+    lowered = start.qpos.at[:, 2].add(-0.5)
     after = jax.jit(jax.vmap(cramped.step))(jax.vmap(cramped.init)(lowered, start.qvel), jnp.zeros((8, 8)))
-    assert bool(jnp.isnan(after.qpos).all(axis=1).any())
+    assert bool(jnp.isnan(after.qpos).all())
