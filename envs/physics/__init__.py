@@ -44,7 +44,7 @@ def why_not(physics: str) -> str:
     if physics != "mjx-warp":
         return ""
     if importlib.util.find_spec("warp") is None:
-        return "the package warp-lang is not installed; run: pip install 'qdos-brax[warp]'"
+        return "the package warp-lang is not installed; run: pip install -c constraints.txt -e '.[warp]'"
     try:
         jax.devices("cuda")
     except RuntimeError:
