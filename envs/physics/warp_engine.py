@@ -5,9 +5,10 @@ own contacts and solver. Against MuJoCo C a control step agrees to 1e-6 (median)
 floor or a wall, it is off by 1e-3 and up to 1e-2. ``MjxEngine`` is the exact one.
 
 Warp stores the contacts of all worlds of a batch in one buffer, and what does not fit is dropped with a printed line.
-Here the buffer has room for every pair of geoms that could touch, in each world, so that neither the search for pairs
-nor the contacts outgrow it; constraint rows have room for as many contacts as ``MjxEngine`` keeps. A world in which
-something was dropped all the same gets a qpos of NaN: ``envs.AutoReset`` ends its episode and counts it.
+Here the buffer has a place for every pair of geoms that could touch, in each world: the search for pairs cannot outgrow
+it, and contacts, at most two for each of a few pairs, do not. Constraint rows, which every world has for itself, have
+room for as many contacts as ``MjxEngine`` keeps. A world in which something was dropped all the same gets a qpos of
+NaN: ``envs.AutoReset`` ends its episode and counts it.
 """
 
 from __future__ import annotations
