@@ -33,12 +33,15 @@ class Body:
     sensors: Sensors | None = None
 
     def engine(self, physics: str, layout: Maze) -> Engine:
-        """The engine called "mjx" or "mujoco" for this body in ``layout``."""
+        """The engine called "mjx", "mjx-warp" or "mujoco" for this body in ``layout``."""
         if physics == "mujoco":
             return MujocoEngine(self.near(False), layout, self.places, sensors=self.sensors)
-        from envs.physics.mjx_engine import MjxEngine  # imported here, for MJX takes seconds to load
+        # imported here, for MJX takes seconds to load
+        from envs.physics.mjx_engine import MjxEngine
+        from envs.physics.warp_engine import MjxWarpEngine
 
-        return MjxEngine(self.near(True), layout, self.most_contacts, self.places, sensors=self.sensors)
+        engine = {engine.name: engine for engine in (MjxEngine, MjxWarpEngine)}[physics]
+        return engine(self.near(True), layout, self.most_contacts, self.places, sensors=self.sensors)
 
 
 ANT = Body(models.ant_model, models.near_walls_ant, most_contacts={3: 8})

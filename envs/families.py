@@ -16,7 +16,7 @@ class Family:
         env_class: "module:class" of the environment.
         observation_size: numbers per observation.
         action_size: numbers per action, each in [-1, 1].
-        engines: the engines it runs on: "mujoco" (MuJoCo C), "mjx".
+        engines: the engines it runs on: "mujoco" (MuJoCo C), "mjx", "mjx-warp" (MuJoCo Warp, on CUDA).
         default_task: the task of a name without "-taskN" (as OGBench's single-task mode).
         episode_lengths: cap in control steps, by maze.
         tasks: by maze, for task 1 to 5: the start cell of everything that has one, the body first, then the goal cell.
@@ -95,7 +95,7 @@ FAMILIES: dict[str, Family] = {
         env_class="envs.locomotion:AntMaze",
         observation_size=29,
         action_size=8,
-        engines=("mujoco", "mjx"),
+        engines=("mujoco", "mjx", "mjx-warp"),
         default_task=1,
         episode_lengths=dict.fromkeys((*_MAZE_TASKS, "teleport"), 1000),
         tasks={**_MAZE_TASKS, "teleport": _TELEPORT_TASKS},
@@ -104,7 +104,7 @@ FAMILIES: dict[str, Family] = {
         env_class="envs.soccer:AntSoccer",
         observation_size=42,
         action_size=8,
-        engines=("mujoco", "mjx"),
+        engines=("mujoco", "mjx", "mjx-warp"),
         default_task=4,
         episode_lengths=dict.fromkeys(_SOCCER_TASKS, 1000),
         tasks=_SOCCER_TASKS,
@@ -113,7 +113,7 @@ FAMILIES: dict[str, Family] = {
         env_class="envs.locomotion:HumanoidMaze",
         observation_size=69,
         action_size=21,
-        engines=("mujoco", "mjx"),
+        engines=("mujoco", "mjx", "mjx-warp"),
         default_task=1,
         episode_lengths={"medium": 2000, "large": 2000, "giant": 4000},
         tasks=_MAZE_TASKS,

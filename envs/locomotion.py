@@ -27,7 +27,7 @@ class BodyEnv(TaskEnv):
 
     Args:
         spec: which task.
-        physics: "mjx" or "mujoco".
+        physics: "mjx", "mjx-warp" or "mujoco".
     """
 
     body: Body

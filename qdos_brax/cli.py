@@ -79,7 +79,7 @@ def train_parser() -> Parser:
     parser.add_argument(
         "--physics",
         metavar="ENGINE",
-        help="auto, mjx or mujoco (default auto: MuJoCo C where there is only a CPU, MJX on an accelerator)",
+        help="auto, mjx, mjx-warp or mujoco (default auto: MuJoCo C where there is only a CPU, MJX on an accelerator)",
     )
     parser.add_argument("--steps", metavar="N", help="environment steps of the online phase")
     parser.add_argument(
@@ -262,6 +262,7 @@ def _tasks(args: argparse.Namespace) -> int:
             for column, (text, width) in enumerate(zip(row, widths, strict=True))
         )
         print("  ".join(cells).rstrip())
+    print("\nmjx-warp runs on CUDA only; which engines run on this machine says: python -m qdos_brax doctor")
     return 0
 
 

@@ -49,6 +49,7 @@ def examine() -> bool:
         _python,
         _packages,
         _devices,
+        _engines,
         _compile_cache,
         _data,
         _callbacks,
@@ -87,6 +88,20 @@ def _devices() -> tuple[bool, str]:
         return False, f"devices: jax cannot start ({' '.join(str(error).split())})"
     kinds = ", ".join(f"{device.platform}:{device.id} ({device.device_kind})" for device in devices)
     return True, f"devices: {kinds}; {len(os.sched_getaffinity(0))} CPU cores"
+
+
+def _engines() -> tuple[bool, str]:
+    """Engines that cannot run here are no fault of the machine: "auto" does not choose them."""
+    from envs.physics import ENGINES, resolve_physics, why_not
+
+    try:
+        chosen = resolve_physics("auto")
+        obstacles = {engine: why_not(engine) for engine in ENGINES}
+    except RuntimeError:
+        return False, "engines: none, for jax cannot start"
+    run = ", ".join(engine + (" (auto)" if engine == chosen else "") for engine in ENGINES if not obstacles[engine])
+    absent = "".join(f"; not {engine}: {obstacle}" for engine, obstacle in obstacles.items() if obstacle)
+    return True, f"engines: {run}{absent}"
 
 
 def _compile_cache() -> tuple[bool, str]:

@@ -69,14 +69,15 @@ def test_flags_reach_the_configuration() -> None:
 
 def test_tasks_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("tasks", train=False) == 0
-    header, *lines = capsys.readouterr().out.splitlines()
+    header, *lines, blank, note = capsys.readouterr().out.splitlines()
+    assert blank == "" and "doctor" in note
     assert header.split() == ["task", "observation", "action", "cap", "engines", "variants", "default", "alias"]
     rows = dict(" ".join(line.split()).split(" ", 1) for line in lines)
     assert set(rows) == {spec.name for spec in envs.list_tasks()} and len(lines) == len(rows) == 9
-    assert rows["antsoccer-arena"] == "42 8 1000 mujoco, mjx task1 to task5 task4 antsoccer"
-    assert rows["humanoidmaze-giant"].startswith("69 21 4000 mujoco, mjx") and rows["humanoidmaze-giant"].endswith(
-        "task1"
-    )
+    assert rows["antsoccer-arena"] == "42 8 1000 mujoco, mjx, mjx-warp task1 to task5 task4 antsoccer"
+    assert rows["humanoidmaze-giant"].startswith("69 21 4000 mujoco, mjx, mjx-warp ") and rows[
+        "humanoidmaze-giant"
+    ].endswith("task1")
 
 
 def test_report_draws_a_picture(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
-"""One control step of physics: two engines behind one interface."""
+"""One control step of physics: engines behind one interface."""
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 
 import jax
@@ -9,9 +10,9 @@ import jax
 from envs.physics.base import Engine, PipelineState, Sensors
 from envs.physics.mujoco_engine import MujocoEngine
 
-__all__ = ["Engine", "MujocoEngine", "PipelineState", "Sensors", "resolve_physics"]
+__all__ = ["ENGINES", "Engine", "MujocoEngine", "PipelineState", "Sensors", "resolve_physics", "why_not"]
 
-ENGINES = ("mjx", "mujoco")
+ENGINES = ("mjx", "mjx-warp", "mujoco")
 
 
 def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
@@ -22,13 +23,36 @@ def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
         supported: the engines that the task runs on; "auto" takes one of them.
 
     Raises:
-        ValueError: there is no such engine, or the task does not run on it.
+        ValueError: there is no such engine, the task does not run on it, or this machine cannot; the message says what
+            to install or to choose.
     """
     if physics == "auto":
         best = "mujoco" if jax.default_backend() == "cpu" else "mjx"
         return best if best in supported else supported[0]
     if physics not in ENGINES:
-        raise ValueError(f"there is no physics engine {physics!r}; choose auto, {' or '.join(ENGINES)}")
+        raise ValueError(f"there is no physics engine {physics!r}; choose auto, {_either(ENGINES)}")
     if physics not in supported:
-        raise ValueError(f"this task does not run on {physics!r}; choose auto or {' or '.join(supported)}")
+        raise ValueError(f"this task does not run on {physics!r}; choose auto or {_either(supported)}")
+    obstacle = why_not(physics)
+    if obstacle:
+        raise ValueError(f"physics {physics!r} cannot run here: {obstacle}")
     return physics
+
+
+def why_not(physics: str) -> str:
+    """Why this machine cannot run the engine, and what mends that; empty where it can."""
+    if physics != "mjx-warp":
+        return ""
+    if importlib.util.find_spec("warp") is None:
+        return "the package warp-lang is not installed; run: pip install -c constraints.txt -e '.[warp]'"
+    try:
+        jax.devices("cuda")
+    except RuntimeError:
+        found = jax.default_backend()
+        return f"it needs a CUDA device, and jax has only {found!r}; install jax[cuda13], or choose mjx or mujoco"
+    return ""
+
+
+def _either(names: Sequence[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last

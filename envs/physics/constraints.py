@@ -90,6 +90,17 @@ class Constraints:
         self._pairs = _tabulate_pairs(model, mjx_model, most_contacts)
         self._root = model.body_rootid[model.dof_bodyid]  # int[nv], whose centre of mass cdof is taken about
 
+    @property
+    def num_pairs(self) -> int:
+        """Pairs of geoms that could touch."""
+        return sum(len(geoms) for pairs in self._pairs for _, geoms in pairs.groups)
+
+    @property
+    def most_rows(self) -> int:
+        """Rows of all joint limits and of the most contacts that are kept: a pyramid has two per tangent."""
+        per_contact = (pairs.keep * max(1, 2 * (pairs.dimension - 1)) for pairs in self._pairs)
+        return len(self._limited) + sum(per_contact)
+
     def rows(self, data: mjx.Data) -> Rows:
         """Of a state whose kinematics, centres of mass and ``qvel`` are in ``data``."""
         found = [self._limit_rows(data), *(self._contact_rows(data, pairs) for pairs in self._pairs)]

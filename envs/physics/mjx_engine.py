@@ -17,7 +17,7 @@ from mujoco import mjx
 from envs.maze import WALL_HALF_SIZE, Maze
 from envs.physics.base import PipelineState, Sensors
 from envs.physics.constraints import Constraints
-from envs.physics.integrators import integrate
+from envs.physics.integrators import Motion, integrate
 from envs.physics.solver import solve
 from envs.physics.walls import cells_in_reach
 
@@ -86,13 +86,18 @@ class MjxEngine:
         for b in self._bodies:
             shift = shift.at[b : b + 2].set(origin)
 
+        start = (state.qpos - shift, state.qvel, state.carry)
+        qpos, qvel, warmstart = self._move(start, walls, action)
+        qpos = qpos + shift
+        return PipelineState(qpos, qvel, self._sense(qpos, qvel), warmstart)
+
+    def _move(self, start: Motion, walls: jax.Array, action: jax.Array) -> Motion:
+        """All sub-steps, with boxes at ``walls[k, 3]``."""
+
         def dynamics(qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array) -> tuple[jax.Array, jax.Array]:
             return self._acceleration(qpos, qvel, warmstart, walls, action)
 
-        start = (state.qpos - shift, state.qvel, state.carry)
-        qpos, qvel, warmstart = integrate(self.model, dynamics, start, self.frame_skip)
-        qpos = qpos + shift
-        return PipelineState(qpos, qvel, self._sense(qpos, qvel), warmstart)
+        return integrate(self.model, dynamics, start, self.frame_skip)
 
     def _near_walls(self, xy: jax.Array, origin: jax.Array) -> jax.Array:
         """Centres float[3, 3] of the boxes around ``xy[2]``, relative to ``origin[2]``; free cells' boxes are sunk."""

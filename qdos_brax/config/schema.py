@@ -336,7 +336,7 @@ class Config:
         method: the name of a recipe in ``qdos_brax.methods``.
         preset: the sizes that were laid over the task's values: "paper", "cpu" or "smoke".
         seed: seeds; several make a scan.
-        physics: engine: "auto" (MuJoCo C on a CPU, MJX on an accelerator), "mjx" or "mujoco".
+        physics: engine: "auto" (MuJoCo C on a CPU, MJX on an accelerator), "mjx", "mjx-warp" (CUDA) or "mujoco".
         dataset: a data file, or None to collect the task's default set.
         out: the run folder, or None to name one under ``run.root``.
         data: collection.
@@ -356,7 +356,7 @@ class Config:
     method: str = field("qdos", Rule("text"))
     preset: str = field("paper", Rule("text"))
     seed: tuple[int, ...] = field((0,), Rule("seeds", low=0, high=2**32 - 1))
-    physics: str = choice("auto", "auto", "mjx", "mujoco")
+    physics: str = choice("auto", "auto", "mjx", "mjx-warp", "mujoco")
     dataset: str | None = field(None, Rule("path"))
     out: str | None = field(None, Rule("path"))
     data: DataConfig = DataConfig()

@@ -1,57 +1,49 @@
-"""100,000 environment steps of every task: nothing breaks, nothing flies."""
+"""100,000 environment steps of every task: nothing breaks, nothing flies. Figures: results/long_rollouts.json."""
 
 from __future__ import annotations
 
-from typing import Any
-
-import jax
-import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 import envs
-from envs.physics.walls import cells_in_reach
-from qdos_brax.experts import policies
-
-STEPS = 100_000
-NUM_ENVS = 100
+from benchmarks import long_rollouts
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "physics"),
-    [*((name, "mujoco") for name in dict.fromkeys(s.name for s in envs.list_tasks())), ("antmaze-large", "mjx")],
+    [
+        *((name, "mujoco") for name in dict.fromkeys(spec.name for spec in envs.list_tasks())),
+        *((name, "mjx") for name in ("antmaze-large", "antsoccer-arena", "humanoidmaze-medium")),
+    ],
 )
 def test_long_rollouts_stay_plausible(name: str, physics: str) -> None:
-    """Half of the ants walk, everything else acts at random; height (m) and speed (m/s) of the body are watched."""
-    env = envs.AutoReset(envs.make(name, physics=physics))
-    act = policies.ant_walker().act if env.spec.family.startswith("ant") else None
-    angle = jax.random.uniform(jax.random.key(1), (NUM_ENVS,), minval=-np.pi, maxval=np.pi)
-    direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    """Bounds are in m, m/s and J; no energy comes from nowhere."""
+    found = long_rollouts.watch(name, physics)
+    print(found)
+    assert found["steps"] == long_rollouts.STEPS and found["not_finite"] == 0
+    for thing in ("body", "ball") if "soccer" in name else ("body",):
+        assert found[thing]["height"]["least"] > 0 and found[thing]["height"]["most"] < 4
+        assert found[thing]["speed"]["most"] < 20
+        assert found[thing]["inside_a_wall"] == 0
+    assert found["energy"]["least"] > 0
+    assert found["energy"]["rose_beyond_motors"] == 0
 
-    def body(state: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
-        action = jax.random.uniform(key, (NUM_ENVS, env.action_size), minval=-1)
-        qpos, qvel = state.pipeline_state.qpos, state.pipeline_state.qvel
-        if act is not None:
-            walks = (jnp.arange(NUM_ENVS) < NUM_ENVS // 2)[:, None]
-            action = jnp.where(walks, act(qpos[:, :15], qvel[:, :14], direction), action)
-        after = jax.vmap(env.step)(state, action)
-        speed = jnp.linalg.norm(after.pipeline_state.qvel[:, :3], axis=1).max()
-        height = after.pipeline_state.qpos[:, 2]
-        return after, {
-            "nan": after.metrics["nan"].sum(),
-            "low": height.min(),
-            "high": height.max(),
-            "speed": speed,
-            "outside": cells_in_reach(env.layout, after.pipeline_state.qpos[:, :2])[1][:, 0].mean(),
-        }
 
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), NUM_ENVS))
-    rollout = jax.jit(lambda s, k: jax.lax.scan(body, s, k))
-    state, seen = rollout(state, jax.random.split(jax.random.key(2), STEPS // NUM_ENVS))
-    print(name, physics, {key: (float(value.min()), float(value.max())) for key, value in seen.items()})
-    assert float(seen["nan"].sum()) == 0
-    assert bool(jnp.isfinite(state.obs).all())
-    assert float(seen["low"].min()) > 0 and float(seen["high"].max()) < 4
-    assert float(seen["speed"].max()) < 20
-    assert float(seen["outside"].max()) == 0
+def test_energy_of_a_falling_ant_is_its_weight_and_its_motion() -> None:
+    model = envs.make("antmaze-medium", physics="mujoco").engine.model
+    mass = model.body_mass.sum()
+    qpos, qvel = np.tile(model.qpos0, (2, 1)), np.zeros((2, model.nv))
+    qpos[1, 2] += 1.0
+    qvel[1, :3] = (3.0, 0.0, -4.0)
+    resting, falling = long_rollouts.energy(model, qpos, qvel)
+    assert falling - resting == pytest.approx(mass * (9.81 * 1.0 + 0.5 * 25), rel=1e-6)
+
+
+def test_motors_work_is_torque_times_the_faster_rate() -> None:
+    xml = """<mujoco><worldbody><body><joint name="hinge" axis="0 0 1"/><geom size="0.1"/></body></worldbody>
+        <actuator><motor joint="hinge" gear="30" ctrlrange="-0.5 0.5"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    work = long_rollouts.motor_work(model, np.array([[1.0], [-4.0], [2.0]]), seconds=0.1)
+    np.testing.assert_allclose(work, [15 * 4 * 0.1, 15 * 4 * 0.1])

@@ -36,19 +36,17 @@ def test_one_step_equals_c_in_a_maze() -> None:
     check_one_step(exactness.one_step_errors(*exactness.both_engines("antmaze-large")))
 
 
-# In free space the humanoid's p99 is 2.5e-5: 27 degrees of freedom, up to 20 contacts of one that lies, in float32.
-NOT_YET = pytest.mark.xfail(reason="the humanoid misses the tolerance in free space", strict=True)
 NAMES = dict.fromkeys(spec.name for spec in envs.list_tasks())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param(n, marks=NOT_YET) if "humanoid" in n else n for n in NAMES])
+@pytest.mark.parametrize("name", list(NAMES))
 def test_every_task_is_as_exact_on_mjx(name: str) -> None:
     check_one_step(exactness.one_step_errors(*exactness.both_engines(name)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in NAMES if "teleport" not in n])  # OGBench draws exits by itself
+@pytest.mark.parametrize("name", list(NAMES))
 def test_every_task_is_ogbenchs_on_mujoco_c(name: str) -> None:
     env = envs.make(name, physics="mujoco")
     assert exactness.against_ogbench(env, jax.jit(jax.vmap(env.engine.step)))["largest_difference"] == 0

@@ -59,7 +59,7 @@ def test_names() -> None:
     ]:
         with pytest.raises(ValueError, match=f"did you mean {near}"):
             envs.make(wrong)
-    with pytest.raises(ValueError, match="auto, mjx or mujoco"):
+    with pytest.raises(ValueError, match="auto, mjx, mjx-warp or mujoco"):
         envs.make("antmaze", physics="bullet")
     assert resolve_physics("auto", ("mjx",)) == "mjx"  # the only one it has, whatever the hardware
     with pytest.raises(ValueError, match="does not run on 'mjx'; choose auto or mujoco"):

@@ -91,19 +91,22 @@ def test_broken_physics_is_reset_and_counted() -> None:
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)
 
 
-@pytest.mark.parametrize("part", ["qpos", "qvel"])
-def test_a_broken_state_in_mujoco_c_resets_its_own_environment_alone(part: str) -> None:
-    env = envs.AutoReset(envs.make("antmaze-medium", physics="mujoco"))
+@pytest.mark.parametrize(
+    ("physics", "part"), [("mujoco", "qpos"), ("mujoco", "qvel"), pytest.param("mjx", "qpos", marks=pytest.mark.slow)]
+)
+def test_a_broken_state_resets_its_own_environment_alone(physics: str, part: str) -> None:
+    env = envs.AutoReset(envs.make("antmaze-medium", physics=physics))
+    step = jax.jit(jax.vmap(env.step))
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
-    states = jax.vmap(env.step)(states, jnp.zeros((3, 8)))
+    states = step(states, jnp.zeros((3, 8)))
     numbers = getattr(states.pipeline_state, part).at[1, 5].set(jnp.nan)
     broken = states.replace(pipeline_state=states.pipeline_state.replace(**{part: numbers}))
-    after, expected = jax.vmap(env.step)(broken, jnp.ones((3, 8))), jax.vmap(env.step)(states, jnp.ones((3, 8)))
+    after, expected = step(broken, jnp.ones((3, 8))), step(states, jnp.ones((3, 8)))
     np.testing.assert_array_equal(after.metrics["nan"], [0, 1, 0])
     np.testing.assert_array_equal(after.done, [0, 1, 0])
     np.testing.assert_array_equal(after.obs[jnp.array([0, 2])], expected.obs[jnp.array([0, 2])])
     assert bool(jnp.isfinite(after.obs).all()) and int(after.info["steps"][1]) == 0
-    onward = jax.vmap(env.step)(after, jnp.ones((3, 8)))
+    onward = step(after, jnp.ones((3, 8)))
     np.testing.assert_array_equal(onward.metrics["nan"], [0, 0, 0])
 
 

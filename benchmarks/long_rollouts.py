@@ -1,0 +1,150 @@
+"""100,000 environment steps of every task: ``python benchmarks/long_rollouts.py [--out results/long_rollouts.json]``.
+
+A hundred environments make a thousand control steps each, with resets in between. Half of the ants walk straight on,
+into the walls; everything else acts at random. Watched are, over all states,
+
+- how many were not finite,
+- height (m) and speed (m/s) of the walking body, and of the ball,
+- mechanical energy (J), kinetic and potential as MuJoCo C reckons them, the floor being the zero; and the most that it
+  rose in one control step, next to the most that the motors could have put in then: torque times the joints' speed (the
+  faster of before and after), all joints together,
+- how often the middle of a body was inside a wall.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+import envs
+from envs.physics.walls import cells_in_reach
+from qdos_brax.experts import policies
+from qdos_brax.runs.folder import write_text
+
+STEPS = 100_000
+NUM_ENVS = 100
+
+
+def rollouts(env: Any, seed: int = 0) -> dict[str, np.ndarray]:
+    """What ``STEPS`` steps of the task went through: qpos[T, N, nq], qvel[T, N, nv], and done and nan[T, N].
+
+    Args:
+        env: with ``AutoReset`` around it; the state after a step that is done is the next episode's first.
+        seed: of starts, directions and actions.
+
+    Returns:
+        Also "start", the (qpos, qvel) before the first step.
+    """
+    reset_key, angle_key, action_key = jax.random.split(jax.random.key(seed), 3)
+    act = policies.ant_walker().act if env.spec.family.startswith("ant") else None
+    angle = jax.random.uniform(angle_key, (NUM_ENVS,), minval=-np.pi, maxval=np.pi)
+    direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+
+    def body(state: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        action = jax.random.uniform(key, (NUM_ENVS, env.action_size), minval=-1)
+        if act is not None:
+            walks = (jnp.arange(NUM_ENVS) < NUM_ENVS // 2)[:, None]
+            before = state.pipeline_state
+            action = jnp.where(walks, act(before.qpos[:, :15], before.qvel[:, :14], direction), action)
+        state = jax.vmap(env.step)(state, action)
+        after = state.pipeline_state
+        return state, {"qpos": after.qpos, "qvel": after.qvel, "done": state.done > 0, "nan": state.metrics["nan"] > 0}
+
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(reset_key, NUM_ENVS))
+    keys = jax.random.split(action_key, STEPS // NUM_ENVS)
+    _, seen = jax.jit(lambda s, k: jax.lax.scan(body, s, k))(state, keys)
+    start = {"qpos": state.pipeline_state.qpos[None], "qvel": state.pipeline_state.qvel[None]}
+    return {
+        name: np.concatenate([start[name], part]) if name in start else np.asarray(part) for name, part in seen.items()
+    }
+
+
+def energy(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """float64[...], kinetic and potential energy (J) of states (qpos[..., nq], qvel[..., nv])."""
+    data = mujoco.MjData(model)
+    found = []
+    for position, velocity in zip(qpos.reshape(-1, model.nq), qvel.reshape(-1, model.nv), strict=True):
+        data.qpos[:], data.qvel[:] = position, velocity
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_makeM(model, data)
+        mujoco.mj_energyPos(model, data)
+        mujoco.mj_energyVel(model, data)
+        found.append(data.energy.sum())
+    return np.asarray(found).reshape(qpos.shape[:-1])
+
+
+def motor_work(model: mujoco.MjModel, qvel: np.ndarray, seconds: float) -> np.ndarray:
+    """float64[T, ...], the most that the motors can do (J) between ``qvel[T + 1, ..., nv]`` and the next, see above."""
+    joints = model.jnt_dofadr[model.actuator_trnid[:, 0]]
+    torque = np.abs(model.actuator_gear[:, 0] * model.actuator_ctrlrange[:, 1])
+    rate = np.abs(qvel[..., joints])
+    return seconds * np.maximum(rate[:-1], rate[1:]) @ torque
+
+
+def watch(name: str, physics: str) -> dict[str, Any]:
+    """The figures of one task on one engine."""
+    began = time.perf_counter()
+    env = envs.AutoReset(envs.make(name, physics=physics))
+    model = env.whole_model()
+    seen = rollouts(env)
+    qpos, qvel = seen["qpos"], seen["qvel"]
+    things = dict(zip(("body", "ball"), env.body.places, strict=False))
+    joules = energy(model, qpos, qvel)
+    jumped = seen["done"] | (np.abs(np.diff(qpos[..., :2], axis=0)).max(axis=-1) > 2)  # a reset or a teleport
+    rise = np.where(jumped, -np.inf, np.diff(joules, axis=0))
+    work = motor_work(model, qvel, env.engine.frame_skip * model.opt.timestep)
+    found: dict[str, Any] = {"steps": int(seen["done"].size), "episodes_ended": int(seen["done"].sum())}
+    found["not_finite"] = int(seen["nan"].sum())
+    for thing, place in things.items():
+        velocity = place - (thing == "ball")  # a free joint has one number more in qpos than in qvel
+        inside = cells_in_reach(env.layout, qpos[..., place : place + 2])[1][..., 0]
+        found[thing] = {
+            "height": span(qpos[..., place + 2]),
+            "speed": span(np.linalg.norm(qvel[..., velocity : velocity + 3], axis=-1)),
+            "inside_a_wall": int(inside.sum()),
+        }
+    most = np.unravel_index(rise.argmax(), rise.shape)
+    found["energy"] = span(joules) | {
+        "most_rise": float(f"{rise[most]:.4g}"),
+        "motors_could_then": float(f"{work[most]:.4g}"),
+        "rose_beyond_motors": int((rise > work).sum()),
+    }
+    return found | {"seconds": round(time.perf_counter() - began)}
+
+
+def span(values: np.ndarray) -> dict[str, float]:
+    """Least, median and most."""
+    least, median, most = (float(f"{value:.4g}") for value in np.quantile(values, [0, 0.5, 1]))
+    return {"least": least, "median": median, "most": most}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = list(dict.fromkeys(spec.name for spec in envs.list_tasks()))
+    parser.add_argument("--tasks", nargs="+", default=names)
+    parser.add_argument("--physics", nargs="+", default=["mujoco", "mjx"])
+    parser.add_argument("--out", type=Path, help="JSON file; what it holds of other tasks and engines stays")
+    args = parser.parse_args()
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    found = json.loads(args.out.read_text()) if args.out and args.out.exists() else {}
+    for physics in args.physics:
+        for task in args.tasks:
+            found[f"{task} {physics}"] = watch(task, physics)
+            print(task, physics, json.dumps(found[f"{task} {physics}"]), flush=True)
+            if args.out:
+                args.out.parent.mkdir(parents=True, exist_ok=True)
+                write_text(args.out, json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
