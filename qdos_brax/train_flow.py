@@ -221,9 +221,12 @@ def _conclude(folder: RunFolder, summary: Mapping[str, Any]) -> None:
         success = member["eval_success"]
         result = "not evaluated" if success is None else f"success {success:.2f} (best {member['best_success']:.2f})"
         first = member["first_goal_step"]
-        goal = "no goal reached" if first is None else f"first goal after {first:,} env steps"
+        if first is not None:
+            result += f", first goal after {first:,} env steps"
+        elif not member["best_success"]:  # what is learned offline reaches goals without a step online
+            result += ", no goal reached"
         state = "" if member["status"] == "ok" else ", FROZEN: its numbers were no longer finite"
-        print(f"  alpha {member['alpha']:g}, seed {member['seed']}: {result}, {goal}{state}")
+        print(f"  alpha {member['alpha']:g}, seed {member['seed']}: {result}{state}")
     print(f"summary   {folder.summary}")
     _say_files(report)
     print(f"evaluate  python -m qdos_brax evaluate {folder.path}", flush=True)

@@ -213,9 +213,8 @@ def crash_at_the_second(chunk: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return crashing
 
 
-@pytest.mark.parametrize(
-    "method", ["diffusion-jsrl", *(pytest.param(name, marks=pytest.mark.slow) for name in ("explore", "iql"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["diffusion-jsrl", "explore", "iql"])
 def test_a_crashed_run_ends_as_if_nothing_had_happened(method: str, tmp_path: Path) -> None:
     config = config_of(method, **{"labels.start_env_steps": 40, "policy.every_updates": 20, "guide.updates": 20})
 
