@@ -200,9 +200,9 @@ class HumanoidWalking:
     """Upright and along the direction, 40 control steps per second.
 
     Reward per control step: for speed along the heading (``policies.humanoid_heading``) most, a parabola that is 0 for
-    none and 2 at PACE (beyond it, it would run, and fall); for being up and facing the way a quarter of that (with
-    more, it stands still and is content); less for speed aside and for effort. Falling ends it. The direction is at
-    first nearly where the body faces, and now and then another.
+    none and 2 at PACE (beyond it, it would run, and fall); for facing the way, or it would not turn; a little for being
+    up (with more, it stands still and is content); less for speed aside and for effort. Falling ends it. The direction
+    is at first nearly where the body faces, and now and then another.
     """
 
     name = "humanoid_walker"
@@ -242,7 +242,7 @@ class HumanoidWalking:
         reward = (
             2.0 * jnp.maximum(1.0 - (velocity[0] / self.PACE - 1.0) ** 2, -1.0)
             + 0.3 * uprightness(after.qpos)
-            + 0.2 * facing
+            + 0.8 * facing
             - 0.2 * jnp.minimum(jnp.abs(velocity[1]), self.PACE)
             - 0.1 * jnp.mean(joints**2)
         )
