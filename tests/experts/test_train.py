@@ -137,7 +137,7 @@ def test_rewards_of_the_humanoid_by_hand() -> None:
     before = life.replace(pipeline=life.pipeline.replace(qpos=qpos))
     after = life.pipeline.replace(qpos=qpos.at[:2].set(jnp.array([0.01, 0.015])))  # 0.025 s: 0.4 m/s aside, 0.6 m/s on
     verdict = task.judge(before, jnp.full(21, 0.5), after)
-    np.testing.assert_allclose(verdict.reward, 1.5 + 0.3 + 0.8 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
+    np.testing.assert_allclose(verdict.reward, 1.5 + 0.3 + 0.2 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
     assert verdict.alive
     assert not task.judge(before, jnp.zeros(21), life.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
 
