@@ -108,13 +108,15 @@ class HumanoidWalker:
 
     def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
         """See ``Policy.act``."""
-        return humanoid_joints(qpos, self.actor.mode(humanoid_view(qpos, qvel, direction)))
+        view = humanoid_view(qpos, qvel, humanoid_heading(qpos, direction))
+        return humanoid_joints(qpos, self.actor.mode(view))
 
 
 def humanoid_heading(qpos: jax.Array, direction: jax.Array) -> jax.Array:
     """The unit vector[..., 2] nearest to ``direction[..., 2]`` that is at most _SHARPEST from where the body faces.
 
-    What lies behind is turned to in a curve: a body that has to change its course at once falls.
+    What lies behind is turned to in a curve: a body that has to change its course at once falls. The walker is trained
+    without this (with it, it learns to walk at that angle and never to turn) and commanded with it.
     """
     ahead = jnp.stack([jnp.ones_like(qpos[..., 0]), jnp.zeros_like(qpos[..., 0])], axis=-1)
     facing = unit_vector(body_view(qpos, jnp.zeros_like(qpos[..., 1:]), ahead)[..., 1:3])
@@ -124,8 +126,8 @@ def humanoid_heading(qpos: jax.Array, direction: jax.Array) -> jax.Array:
 
 
 def humanoid_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
-    """[..., 55]: the body's view along its heading, its fast numbers scaled to be about one."""
-    view = body_view(qpos, qvel, humanoid_heading(qpos, direction))
+    """[..., 55]: the body's view, its fast numbers scaled to be about one."""
+    view = body_view(qpos, qvel, direction)
     still, spin, swing = jnp.split(view, [31, 34], axis=-1)
     return jnp.concatenate([still, spin * _SPIN_SCALE, swing * _SWING_SCALE], axis=-1)
 

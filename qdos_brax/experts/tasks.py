@@ -199,10 +199,10 @@ def ant_is_up(qpos: jax.Array) -> jax.Array:
 class HumanoidWalking:
     """Upright and along the direction, 40 control steps per second.
 
-    Reward per control step: for speed along the heading (``policies.humanoid_heading``) most, a parabola that is 0 for
-    none and 2 at PACE (beyond it, it would run, and fall); for being up and facing the way a quarter of that (with
-    more, it stands still and is content); less for speed aside and for effort. Falling ends it. The direction is at
-    first nearly where the body faces, and now and then another.
+    Reward per control step: for speed along the direction most, a parabola that is 0 for none and 2 at PACE (beyond
+    it, it would run, and fall); for being up and facing the way a quarter of that (with more, it stands still and is
+    content); less for speed aside and for effort. Falling ends it. The direction is at first nearly where the body
+    faces, and now and then another.
     """
 
     name = "humanoid_walker"
@@ -236,8 +236,7 @@ class HumanoidWalking:
 
     def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
         """See the class."""
-        heading = policies.humanoid_heading(before.pipeline.qpos, before.direction)
-        velocity = turned(after.qpos[:2] - before.pipeline.qpos[:2], heading) / self._seconds
+        velocity = turned(after.qpos[:2] - before.pipeline.qpos[:2], before.direction) / self._seconds
         facing = body_view(after.qpos, after.qvel, before.direction)[1]
         reward = (
             2.0 * jnp.maximum(1.0 - (velocity[0] / self.PACE - 1.0) ** 2, -1.0)
