@@ -66,6 +66,7 @@ def sampled(learner, state):
     return np.asarray(jax.jit(learner.sample)(learner.params(state), jax.random.key(1), seen)).reshape(2, 2000, -1)
 
 
+@pytest.mark.slow
 def test_both_modes_keep_their_shares_which_no_gaussian_can():
     observation, action = two_modes()
     learner = DiffusionBC(1, 2, hidden=32, steps=10, batch_size=256, blocks=2, dropout=0.0)
