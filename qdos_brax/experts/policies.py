@@ -20,9 +20,10 @@ from flax import traverse_util
 
 from qdos_brax.errors import UserError
 from qdos_brax.experts.symmetry import HUMANOID_ACTUATED
-from qdos_brax.experts.views import ANT_NQ, ANT_NV, ball_view, body_view, turned, unit_vector
+from qdos_brax.experts.views import ANT_NQ, ANT_NV, ball_view, body_view, forward_axis, turned, turned_back
 from qdos_brax.networks import DiagonalGaussian
 from qdos_brax.runs.folder import replacing
+from qdos_brax.vectors import unit_vector
 
 RESIDUAL = 1.0
 """How much of a joint's range the dribbler can add to the walker's action."""
@@ -118,11 +119,10 @@ def humanoid_heading(qpos: jax.Array, direction: jax.Array) -> jax.Array:
     What lies behind is turned to in a curve: a body that has to change its course at once falls. The walker is trained
     without this (with it, it learns to walk at that angle and never to turn) and commanded with it.
     """
-    ahead = jnp.stack([jnp.ones_like(qpos[..., 0]), jnp.zeros_like(qpos[..., 0])], axis=-1)
-    facing = unit_vector(body_view(qpos, jnp.zeros_like(qpos[..., 1:]), ahead)[..., 1:3])
+    facing = unit_vector(forward_axis(qpos)[..., :2])
     seen = turned(direction, facing)
     angle = jnp.clip(jnp.arctan2(seen[..., 1], seen[..., 0]), -_SHARPEST, _SHARPEST)
-    return turned(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), facing * jnp.array([1.0, -1.0]))
+    return turned_back(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), facing)
 
 
 def humanoid_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
@@ -166,8 +166,8 @@ def dribbler_joints(
     """
     offset = ball_view(qpos, qvel, direction)[..., :2]
     heading = unit_vector(push_heading(offset) + _OVERRIDE * command[..., :2])
-    back = direction * jnp.array([1.0, -1.0])  # seen along this, what was turned is as it was in the world
-    return jnp.clip(walker.act(qpos, qvel, turned(heading, back)) + RESIDUAL * command[..., 2:], -1.0, 1.0)
+    steps = walker.act(qpos, qvel, turned_back(heading, direction))
+    return jnp.clip(steps + RESIDUAL * command[..., 2:], -1.0, 1.0)
 
 
 def push_heading(offset: jax.Array) -> jax.Array:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.maze import UNIT, Maze
-from qdos_brax.experts.views import unit_vector
+from qdos_brax.vectors import unit_vector
 
 _CORRIDOR = 1.2  # m to either side of a straight line that must be free: the reach of the ant's legs
 

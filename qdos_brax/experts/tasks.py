@@ -17,7 +17,7 @@ from envs.locomotion import dropped_humanoid, dropped_poses
 from envs.physics.base import PipelineState
 from envs.physics.mujoco_engine import MujocoEngine
 from qdos_brax.experts import policies, symmetry
-from qdos_brax.experts.views import ANT_NQ, ANT_NV, body_view, random_direction, turned, uprightness
+from qdos_brax.experts.views import ANT_NQ, ANT_NV, body_view, forward_axis, random_direction, turned, uprightness
 from qdos_brax.high_level.sac import Batch
 
 
@@ -237,7 +237,7 @@ class HumanoidWalking:
     def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
         """See the class."""
         velocity = turned(after.qpos[:2] - before.pipeline.qpos[:2], before.direction) / self._seconds
-        facing = body_view(after.qpos, after.qvel, before.direction)[1]
+        facing = forward_axis(after.qpos)[:2] @ before.direction
         reward = (
             2.0 * jnp.maximum(1.0 - (velocity[0] / self.PACE - 1.0) ** 2, -1.0)
             + 0.3 * uprightness(after.qpos)

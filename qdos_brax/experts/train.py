@@ -143,14 +143,13 @@ class Trainer:
         onward = Life(after, jnp.where(turns, directions, lives.direction), lives.clock + 1)
         fresh = jax.vmap(self.task.reset)(jax.random.split(reset_key, n))
         goes_on = verdict.alive & ~verdict.lost & (onward.clock < self.task.life_steps)
-        onward = jax.tree.map(lambda a, b: jnp.where(goes_on.reshape(n, *[1] * (a.ndim - 1)), a, b), onward, fresh)
         info = {
             "reward": verdict.reward,
             "falls_per_1000": 1000.0 * (1.0 - verdict.alive),
             "lost_per_1000": 1000.0 * verdict.lost,
             **verdict.measures,
         }
-        return row, onward, jax.tree.map(jnp.mean, info)
+        return row, _by_row(goes_on, onward, fresh), jax.tree.map(jnp.mean, info)
 
     def _updates(
         self, replay: replay_buffer.Replay, sac: SACState, key: jax.Array
@@ -160,7 +159,8 @@ class Trainer:
         for sub_key in jax.random.split(key, self.sizes.actor_every):
             sample_key, mirror_key, critic_key, actor_key = jax.random.split(sub_key, 4)
             batch = replay_buffer.sample(replay, sample_key, self.sizes.batch_size)
-            batch = _either(mirror_key, batch, self.task.mirror(batch))
+            straight = jax.random.bernoulli(mirror_key, shape=batch.reward.shape)
+            batch = _by_row(straight, batch, self.task.mirror(batch))
             sac, info = self.sac.update_critic(sac, batch, critic_key, self.hyper)
         sac, actor_info = self.sac.update_actor(sac, batch.observation, actor_key, self.hyper)
         return sac, {**info, **actor_info}
@@ -180,10 +180,9 @@ class Trainer:
         return jax.tree.map(jnp.mean, info)
 
 
-def _either(key: jax.Array, batch: Batch, other: Batch) -> Batch:
-    """Each row from ``batch`` or, as likely, from ``other``."""
-    takes = jax.random.bernoulli(key, shape=batch.reward.shape)
-    return jax.tree.map(lambda a, b: jnp.where(takes.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, other)
+def _by_row(chosen: jax.Array, these: Any, those: Any) -> Any:
+    """Rows of ``these`` where ``chosen``[n], of ``those`` elsewhere."""
+    return jax.tree.map(lambda a, b: jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b), these, those)
 
 
 class Training:

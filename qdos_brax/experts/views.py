@@ -20,9 +20,15 @@ def turned(vector: jax.Array, direction: jax.Array) -> jax.Array:
     return jnp.concatenate([cos * x + sin * y, cos * y - sin * x, vector[..., 2:]], axis=-1)
 
 
-def unit_vector(vector: jax.Array) -> jax.Array:
-    """``vector[..., 2]`` at length one; zero stays zero."""
-    return vector / jnp.maximum(jnp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6)
+def turned_back(vector: jax.Array, direction: jax.Array) -> jax.Array:
+    """``vector[..., 2 or 3]`` as it is in the world, where it is given as ``turned`` by ``direction[..., 2]``."""
+    return turned(vector, direction * jnp.array([1.0, -1.0]))
+
+
+def forward_axis(qpos: jax.Array) -> jax.Array:
+    """[..., 3], the root's own x axis in the world."""
+    w, x, y, z = _unit_quaternion(qpos)
+    return jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
 
 
 def body_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
@@ -37,14 +43,12 @@ def body_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Arr
         [..., 13 + 2 k]: height, two columns of the turned rotation matrix, joints, turned linear velocity, angular
         velocity, joint velocities.
     """
-    quat = qpos[..., 3:7]
-    w, x, y, z = jnp.moveaxis(quat / (jnp.linalg.norm(quat, axis=-1, keepdims=True) + 1e-8), -1, 0)
-    forward = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+    w, x, y, z = _unit_quaternion(qpos)
     upward = jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
     return jnp.concatenate(
         [
             qpos[..., 2:3],
-            turned(forward, direction),
+            turned(forward_axis(qpos), direction),
             turned(upward, direction),
             qpos[..., 7:],
             turned(qvel[..., :3], direction),
@@ -72,3 +76,9 @@ def random_direction(key: jax.Array) -> jax.Array:
     """A unit vector[2], uniform over the circle."""
     angle = jax.random.uniform(key, (), minval=-jnp.pi, maxval=jnp.pi)
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+def _unit_quaternion(qpos: jax.Array) -> jax.Array:
+    """The root's w, x, y, z, [4, ...]."""
+    quat = qpos[..., 3:7]
+    return jnp.moveaxis(quat / (jnp.linalg.norm(quat, axis=-1, keepdims=True) + 1e-8), -1, 0)

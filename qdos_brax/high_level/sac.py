@@ -64,6 +64,11 @@ def adam_step(params: Params, moments: optax.OptState, grads: Params, learning_r
     return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), moments
 
 
+def polyak(target: Params, params: Params, rate: jax.Array | float) -> Params:
+    """``target`` moved towards ``params`` by ``rate`` of the way."""
+    return jax.tree.map(lambda t, p: t + rate * (p - t), target, params)
+
+
 class SAC:
     """The learner.
 
@@ -170,7 +175,7 @@ class SAC:
         target = jax.lax.stop_gradient(batch.reward + hyper.discount * batch.mask * bootstrap)
         loss, grads = jax.value_and_grad(self.critic_loss)(state.critic, batch, target)
         critic, moments = adam_step(state.critic, state.critic_moments, grads, hyper.learning_rate)
-        target_critic = jax.tree.map(lambda t, c: t + hyper.target_rate * (c - t), state.target_critic, critic)
+        target_critic = polyak(state.target_critic, critic, hyper.target_rate)
         info = {"critic_loss": loss / self.ensemble, "q": jnp.mean(target)}
         return state.replace(critic=critic, critic_moments=moments, target_critic=target_critic), info
 

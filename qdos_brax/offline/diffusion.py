@@ -19,7 +19,7 @@ import optax
 from flax import struct
 
 from qdos_brax.data.device import DeviceData
-from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.high_level.sac import ADAM, adam_step, polyak
 from qdos_brax.offline.rows import random_rows
 
 Params = Any
@@ -154,7 +154,7 @@ class DiffusionBC:
         """One gradient step on observation[B, obs], action[B, act]; the average follows."""
         loss, grads = jax.value_and_grad(self.loss)(state.denoiser, observation, action, key)
         denoiser, moments = adam_step(state.denoiser, state.moments, grads, hyper.learning_rate)
-        average = jax.tree.map(lambda a, p: a + hyper.average_rate * (p - a), state.average, denoiser)
+        average = polyak(state.average, denoiser, hyper.average_rate)
         return DiffusionState(denoiser, average, moments), {"denoising_loss": loss}
 
     def sample(self, params: dict[str, Any], key: jax.Array, observation: jax.Array) -> jax.Array:

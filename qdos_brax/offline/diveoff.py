@@ -24,7 +24,7 @@ import optax
 from flax import struct
 
 from qdos_brax.data.device import DeviceData
-from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.high_level.sac import ADAM, adam_step, polyak
 from qdos_brax.networks import MLP, DiagonalGaussian, Ensemble, gaussian_kl, gaussian_log_prob, gaussian_sample
 from qdos_brax.offline.iql_policy import regression_weight
 from qdos_brax.offline.policy import GaussianPolicy, weighted_imitation_loss
@@ -230,11 +230,10 @@ class DiveOff:
         (loss, information), grads = jax.value_and_grad(shared_loss, has_aux=True)((state.autoencoder, actor))
         rate = hyper.autoencoder_rate * hyper.learning_rate
         (autoencoder, actor), shared_moments = adam_step((state.autoencoder, actor), state.shared_moments, grads, rate)
-        follow = lambda target, own: jax.tree.map(lambda t, p: t + hyper.target_rate * (p - t), target, own)  # noqa: E731
         state = state.replace(
             actor=actor,
-            target_actor=follow(state.target_actor, actor),
-            target_critic=follow(state.target_critic, state.critic),
+            target_actor=polyak(state.target_actor, actor, hyper.target_rate),
+            target_critic=polyak(state.target_critic, state.critic, hyper.target_rate),
             autoencoder=autoencoder,
             actor_moments=actor_moments,
             shared_moments=shared_moments,

@@ -18,11 +18,12 @@ import optax
 from flax import struct
 
 from qdos_brax.data.device import DeviceData
-from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.high_level.sac import ADAM, adam_step, polyak
 from qdos_brax.networks import MLP
 from qdos_brax.offline.iql_policy import IQLPolicy, IQLPolicyHyper, IQLPolicyState
 from qdos_brax.offline.rows import random_rows
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper
+from qdos_brax.vectors import unit_vector
 
 Params = Any
 _HEADS = 2  # phi and its twin; skills and distances are those of the first
@@ -132,8 +133,7 @@ class Hilbert:
 
         Where the two coincide it is 0.
         """
-        difference = self.represent(params, end) - self.represent(params, start)
-        return difference / jnp.maximum(jnp.linalg.norm(difference, axis=-1, keepdims=True), 1e-6)
+        return unit_vector(self.represent(params, end) - self.represent(params, start))
 
     def act(self, params: dict[str, Any], observation: jax.Array, latent: jax.Array) -> jax.Array:
         """The mode of pi(a | s, z), [..., act] in [-1, 1]."""
@@ -181,7 +181,7 @@ class Hilbert:
         """One step of phi and its target on ``batch``, and one of the skills ``latent``[B, d] on its transitions."""
         loss, grads = jax.value_and_grad(self.distance_loss)(state.phi, state.target_phi, batch, hyper)
         phi, moments = adam_step(state.phi, state.phi_moments, grads, hyper.learning_rate)
-        target_phi = jax.tree.map(lambda t, p: t + hyper.target_rate * (p - t), state.target_phi, phi)
+        target_phi = polyak(state.target_phi, phi, hyper.target_rate)
         values = ValueHyper(hyper.learning_rate, hyper.skill_expectile, hyper.target_rate)
         skill_hyper = IQLPolicyHyper(values, hyper.learning_rate, hyper.inverse_temperature)
         seen = self.skill_batch(state.phi, batch, latent, hyper.discount)
@@ -215,5 +215,4 @@ class Hilbert:
 
 def random_directions(key: jax.Array, size: int, dim: int) -> jax.Array:
     """float32[size, dim], uniform on the unit sphere."""
-    normal = jax.random.normal(key, (size, dim))
-    return normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
+    return unit_vector(jax.random.normal(key, (size, dim)))

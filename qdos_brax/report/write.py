@@ -9,8 +9,8 @@ from pathlib import Path
 from qdos_brax.errors import UserError
 from qdos_brax.report.curves import draw_curves, draw_scans
 from qdos_brax.report.page import write_page
-from qdos_brax.report.study import Study, read_study
-from qdos_brax.report.tables import first_goal_csv, success_csv, tables
+from qdos_brax.report.study import read_study
+from qdos_brax.report.tables import Table, first_goal_csv, success_csv, tables
 from qdos_brax.runs.folder import user_errors, write_text
 
 
@@ -48,6 +48,7 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) 
     if not out.is_dir():
         raise UserError(f"--out {out} must be a folder for the report's files")
     page, curves, scan = out / "report.html", out / "curves.png", out / "scan.png"
+    found = tables(study)
     draw_curves(study, curves)
     files = [page, curves]
     if draw_scans(study, scan):
@@ -55,21 +56,21 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) 
     for name, text in (
         ("table1.csv", success_csv(study)),
         ("table2.csv", first_goal_csv(study)),
-        ("report.md", _markdown(study)),
+        ("report.md", _markdown(found, study.notes)),
     ):
         write_text(out / name, text)
         files.append(out / name)
     write_page(study, page)
-    return Report(_text(study), page, curves, files)
+    return Report(_text(found, study.notes), page, curves, files)
 
 
-def _text(study: Study) -> str:
-    parts = [table.text() for table in tables(study)]
-    notes = "\n".join(f"note: {note}" for note in study.notes)
+def _text(found: list[Table], remarks: Sequence[str]) -> str:
+    parts = [table.text() for table in found]
+    notes = "\n".join(f"note: {remark}" for remark in remarks)
     return "\n\n".join([*parts, *([notes] if notes else [])])
 
 
-def _markdown(study: Study) -> str:
-    parts = [table.markdown() for table in tables(study)]
-    notes = "\n".join(f"- {note}" for note in study.notes)
+def _markdown(found: list[Table], remarks: Sequence[str]) -> str:
+    parts = [table.markdown() for table in found]
+    notes = "\n".join(f"- {remark}" for remark in remarks)
     return "\n\n".join([*parts, *([notes] if notes else [])]) + "\n"

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from qdos_brax.latent_map import MARGIN, Prior, latent_map
 from qdos_brax.networks import gaussian_log_prob, gaussian_sample
 from qdos_brax.skills.vae import Posterior, Segments, SkillModel
+from qdos_brax.vectors import unit_vector
 
 Box = jax.Array | float  # half the side of the box of latents, ``skills.latent_box``
 
@@ -180,7 +181,7 @@ class DirectionSource:
 
     def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
         """z = u / ||u||."""
-        return unit(action)
+        return unit_vector(action)
 
     def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
         """u = z: of all that point there, the one that a unit vector is."""
@@ -188,7 +189,7 @@ class DirectionSource:
 
     def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
         """Uniform over the directions."""
-        latent = unit(jax.random.normal(key, (*observation.shape[:-1], self.width)))
+        latent = unit_vector(jax.random.normal(key, (*observation.shape[:-1], self.width)))
         return self.to_action(params, latent, observation, box)
 
     def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
@@ -234,8 +235,3 @@ class ActionSource:
     def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
         """z itself."""
         return latent
-
-
-def unit(vector: jax.Array) -> jax.Array:
-    """The vector[..., d] over its length, which is taken as at least 1e-6."""
-    return vector / jnp.maximum(jnp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from qdos_brax.high_level.sac import ADAM, Params, adam_step
+from qdos_brax.high_level.sac import ADAM, Params, adam_step, polyak
 from qdos_brax.networks import MLP, Ensemble
 
 
@@ -101,6 +101,6 @@ class IQL:
         value, value_moments = adam_step(state.value, state.value_moments, grads, hyper.learning_rate)
         critic_loss, grads = jax.value_and_grad(self.critic_loss)(state.critic, value, batch)
         critic, critic_moments = adam_step(state.critic, state.critic_moments, grads, hyper.learning_rate)
-        target_critic = jax.tree.map(lambda t, c: t + hyper.target_rate * (c - t), state.target_critic, critic)
+        target_critic = polyak(state.target_critic, critic, hyper.target_rate)
         info = {"value_loss": value_loss, "value_q_loss": critic_loss}
         return ValueState(value, critic, target_critic, value_moments, critic_moments), info
