@@ -11,6 +11,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from qdos_brax.gru import BidirectionalGRU
+
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 
 
@@ -78,40 +80,6 @@ class DiagonalGaussian(nn.Module):
         return mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
 
 
-class GRULayer(nn.Module):
-    """One gated recurrent layer (Cho et al. 2014) in the reset-after form of cuDNN and PyTorch.
-
-    The input's share of the three gates is one matmul over all time steps; only the recurrent share is scanned,
-    which is what makes it fast on a CPU.
-
-    Attributes:
-        hidden: state width.
-        reverse: run from the last time step to the first.
-    """
-
-    hidden: int
-    reverse: bool = False
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Maps [B, T, in] to (outputs[B, T, hidden], the state after the last step[B, hidden])."""
-        gates = nn.Dense(3 * self.hidden, name="input")(x)
-        kernel = self.param("recurrent", nn.initializers.orthogonal(), (self.hidden, 3 * self.hidden))
-        bias = self.param("recurrent_bias", nn.initializers.zeros, (3 * self.hidden,))
-
-        def step(state: jax.Array, gate: jax.Array) -> tuple[jax.Array, jax.Array]:
-            reset_x, update_x, new_x = jnp.split(gate, 3, axis=-1)
-            reset_h, update_h, new_h = jnp.split(state @ kernel + bias, 3, axis=-1)
-            update = nn.sigmoid(update_x + update_h)
-            candidate = jnp.tanh(new_x + nn.sigmoid(reset_x + reset_h) * new_h)
-            state = (1 - update) * candidate + update * state
-            return state, state
-
-        start = jnp.zeros((x.shape[0], self.hidden), x.dtype)
-        last, outputs = jax.lax.scan(step, start, jnp.swapaxes(gates, 0, 1), reverse=self.reverse)
-        return jnp.swapaxes(outputs, 0, 1), last
-
-
 class SegmentEncoder(nn.Module):
     """The posterior q(z | tau): stacked bidirectional GRUs over (s_t, a_t), diagonal Gaussian on the last states.
 
@@ -128,12 +96,9 @@ class SegmentEncoder(nn.Module):
     @nn.compact
     def __call__(self, observations: jax.Array, actions: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Maps observations[B, H, obs] and actions[B, H, act] to (mean[B, z], log standard deviation[B, z])."""
-        x = jnp.concatenate([observations, actions], axis=-1)
+        x = jnp.swapaxes(jnp.concatenate([observations, actions], axis=-1), 0, 1)
         for _ in range(self.layers):
-            forward, forward_last = GRULayer(self.hidden)(x)
-            backward, backward_last = GRULayer(self.hidden, reverse=True)(x)
-            x = jnp.concatenate([forward, backward], axis=-1)
-        summary = jnp.concatenate([forward_last, backward_last], axis=-1)
+            x, summary = BidirectionalGRU(self.hidden)(x)
         mean, log_std = jnp.split(nn.Dense(2 * self.latent_dim)(summary), 2, axis=-1)
         return mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
 

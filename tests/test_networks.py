@@ -1,6 +1,5 @@
-"""Densities and recurrent layers against independent formulas."""
+"""Densities against independent formulas, and the ensemble."""
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,37 +33,6 @@ def test_tanh_gaussian_density_integrates_like_the_change_of_variables():
 def test_tanh_gaussian_log_prob_is_finite_in_the_corners():
     u, log_prob = networks.tanh_gaussian_sample(jax.random.key(0), jnp.array([40.0, -40.0]), jnp.zeros(2))
     assert np.all(np.isfinite(log_prob)) and np.all(np.abs(u) <= 1)
-
-
-def test_gru_layer_equals_a_loop_of_flax_cells():
-    # flax's GRUCell has no bias on the recurrent reset and update gates and one on the candidate's; ours starts at 0.
-    x = jax.random.normal(jax.random.key(0), (2, 6, 3))
-    layer = networks.GRULayer(4)
-    params = layer.init(jax.random.key(1), x)["params"]
-    kernels = jnp.split(params["input"]["kernel"], 3, axis=1)
-    recurrent = jnp.split(params["recurrent"], 3, axis=1)
-    cell_params = {}
-    for index, gate in enumerate("rzn"):
-        cell_params[f"i{gate}"] = {"kernel": kernels[index], "bias": jnp.zeros(4)}
-        cell_params[f"h{gate}"] = {"kernel": recurrent[index]}
-    cell_params["hn"]["bias"] = jnp.zeros(4)
-    cell = nn.GRUCell(4)
-    state, outputs = jnp.zeros((2, 4)), []
-    for t in range(6):
-        state, _ = cell.apply({"params": cell_params}, state, x[:, t])
-        outputs.append(state)
-    ours, last = layer.apply({"params": params}, x)
-    np.testing.assert_allclose(ours, jnp.stack(outputs, axis=1), atol=1e-5)
-    np.testing.assert_allclose(last, state, atol=1e-5)
-
-
-def test_gru_layer_in_reverse_is_the_layer_on_the_reversed_sequence():
-    x = jax.random.normal(jax.random.key(0), (2, 5, 3))
-    params = networks.GRULayer(4).init(jax.random.key(1), x)
-    forward, _ = networks.GRULayer(4).apply(params, x[:, ::-1])
-    backward, last = networks.GRULayer(4, reverse=True).apply(params, x)
-    np.testing.assert_allclose(backward, forward[:, ::-1], atol=1e-6)
-    np.testing.assert_allclose(last, backward[:, 0], atol=1e-6)
 
 
 def test_ensemble_members_differ_and_do_not_mix():
