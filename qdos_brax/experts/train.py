@@ -28,12 +28,13 @@ from qdos_brax.experts import policies
 from qdos_brax.experts.tasks import TASKS, Life, Task
 from qdos_brax.experts.views import random_direction
 from qdos_brax.high_level import replay as replay_buffer
-from qdos_brax.high_level.sac import SAC, Batch, SACHyper, SACState
+from qdos_brax.high_level.sac import SAC, Batch, SACHyper, SACState, polyak
 from qdos_brax.runs.checkpoint import CheckpointStore, Position, choose
 from qdos_brax.runs.folder import write_text
 
 EVALUATION_STEPS = 250
 INITIAL_TEMPERATURE = 0.1
+AVERAGE_RATE = 0.002  # per step of all environments, at which the policy that is kept follows the one that learns
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,10 @@ class Sizes:
 
 
 class TrainState(struct.PyTreeNode):
-    """Everything the loop carries."""
+    """Everything the loop carries; ``average`` is the running mean of the actor, steadier than any one of them."""
 
     sac: SACState
+    average: Any
     replay: replay_buffer.Replay
     lives: Life
     key: jax.Array
@@ -93,8 +95,10 @@ class Trainer:
         clocks = jax.random.randint(clock_key, (n,), 0, self.task.life_steps)  # so that they do not all end at once
         observation = jnp.zeros(self.task.observation_dim)
         row = Batch(observation, jnp.zeros(self.task.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
+        sac = self.sac.init(sac_key, INITIAL_TEMPERATURE) if learner is None else learner
         return TrainState(
-            sac=self.sac.init(sac_key, INITIAL_TEMPERATURE) if learner is None else learner,
+            sac=sac,
+            average=jax.tree.map(jnp.copy, sac.actor),
             replay=replay_buffer.create(row, self.sizes.capacity),
             lives=lives.replace(clock=clocks),
             key=key,
@@ -111,7 +115,9 @@ class Trainer:
             count = self.sizes.updates_per_step // self.sizes.actor_every
             keys = jax.random.split(state.key, count + 1)
             sac, losses = jax.lax.scan(partial(self._updates, state.replay), state.sac, keys[1:])
-            return state.replace(sac=sac, key=keys[0]), {**info, **jax.tree.map(jnp.mean, losses)}
+            average = polyak(state.average, sac.actor, AVERAGE_RATE)
+            state = state.replace(sac=sac, average=average, key=keys[0])
+            return state, {**info, **jax.tree.map(jnp.mean, losses)}
 
         state, info = jax.lax.scan(step, state, length=self.sizes.steps_per_chunk)
         return state, jax.tree.map(jnp.mean, info)
@@ -235,12 +241,12 @@ class Training:
                 self._save(row, command)
 
     def _save(self, row: dict[str, float], command: str) -> None:
-        reached = self.trainer.evaluate(self.state.sac.actor, self.evaluate_key)
+        reached = self.trainer.evaluate(self.state.average, self.evaluate_key)
         row = row | {name: float(f"{float(value):.5g}") for name, value in reached.items()}
         self.rows.append(row)
         print("evaluation " + json.dumps(row), flush=True)
         header = {"command": command, "seed": self.seed, **row}
-        actor = policies.Actor(self.sizes.hidden, self.trainer.task.action_dim, self.state.sac.actor, header)
+        actor = policies.Actor(self.sizes.hidden, self.trainer.task.action_dim, self.state.average, header)
         policies.write_actor(self.folder / f"{self.name}.npz", actor)
         write_learner(self.folder / f"{self.name}-learner.npz", self.state.sac)
         write_text(self.folder / f"{self.name}.csv", _table(self.rows))
