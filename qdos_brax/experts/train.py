@@ -34,7 +34,6 @@ from qdos_brax.runs.folder import write_text
 
 EVALUATION_STEPS = 250
 INITIAL_TEMPERATURE = 0.1
-AVERAGE_RATE = 0.002  # per step of all environments, at which the policy that is kept follows the one that learns
 
 
 @dataclass(frozen=True)
@@ -50,6 +49,7 @@ class Sizes:
         capacity: rows of the replay.
         random_steps: first rows, with random actions and without updates.
         steps_per_chunk: steps of all environments per call of the program.
+        average_rate: per step of all environments, at which the policy that is kept follows the one that learns.
     """
 
     num_envs: int = 64
@@ -60,6 +60,7 @@ class Sizes:
     capacity: int = 500_000
     random_steps: int = 5_000
     steps_per_chunk: int = 50
+    average_rate: float = 0.002
 
 
 class TrainState(struct.PyTreeNode):
@@ -115,7 +116,7 @@ class Trainer:
             count = self.sizes.updates_per_step // self.sizes.actor_every
             keys = jax.random.split(state.key, count + 1)
             sac, losses = jax.lax.scan(partial(self._updates, state.replay), state.sac, keys[1:])
-            average = polyak(state.average, sac.actor, AVERAGE_RATE)
+            average = polyak(state.average, sac.actor, self.sizes.average_rate)
             state = state.replace(sac=sac, average=average, key=keys[0])
             return state, {**info, **jax.tree.map(jnp.mean, losses)}
 

@@ -18,7 +18,14 @@ from qdos_brax.experts.views import random_direction, turned
 from qdos_brax.high_level.sac import Batch
 
 SIZES = Sizes(
-    num_envs=8, updates_per_step=8, batch_size=64, hidden=(64, 64), capacity=2000, random_steps=400, steps_per_chunk=25
+    num_envs=8,
+    updates_per_step=8,
+    batch_size=64,
+    hidden=(64, 64),
+    capacity=2000,
+    random_steps=400,
+    steps_per_chunk=25,
+    average_rate=0.02,
 )
 
 
