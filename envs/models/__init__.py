@@ -6,9 +6,9 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mujoco
-import numpy as np
 
 from envs.maze import TELEPORT_RADIUS, WALL_HALF_SIZE, Maze
+from envs.models.pairs import list_pairs
 from envs.physics.walls import WALLS, WALLS_AROUND
 
 _ANT = Path(__file__).with_name("ant.xml")
@@ -16,8 +16,6 @@ _HUMANOID = Path(__file__).with_name("humanoid.xml")
 
 # Collision bits of the models for MJX: what ant or humanoid touch, the ant against the ball, what the ball touches.
 _BODY_BIT, _KICK_BIT, _BALL_BIT = 1, 2, 4
-
-_BOUNDLESS = 1e6
 
 
 def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
@@ -91,16 +89,17 @@ def near_walls_humanoid(mocap: bool) -> mujoco.MjModel:
 
 
 def _compile_for_c(root: ET.Element) -> mujoco.MjModel:
-    """The walls will move, so the volumes that bound several of them become boundless; each one's own moves with it.
+    """What can touch is listed beforehand; see ``envs.models.pairs``.
 
-    Without any bounding volumes (``mjDSBL_MIDPHASE``) contacts would be found in another order. MuJoCo's own reset of
-    states that blow up is off: whoever steps the model shall see them.
+    MuJoCo's own reset of states that blow up is off: whoever steps the model shall see them. So are islands where all
+    joints hang together: there is only one, and looking for it costs time and changes nothing.
     """
-    model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+    spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    list_pairs(spec)
+    model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    first, count = model.body_bvhadr[0], model.body_bvhnum[0]
-    inner = first + np.flatnonzero(model.bvh_nodeid[first : first + count] < 0)
-    model.bvh_aabb[inner] = (0, 0, 0, *[_BOUNDLESS] * 3)  # centre, half sizes
+    if model.ntree == 1:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     return model
 
 

@@ -43,7 +43,8 @@ class MujocoEngine:
 
     Args:
         model: the compiled model; no activation states and no plugins (the ant and humanoid tasks have none). With a
-            layout, it has ``WALLS`` boxes per body, geoms of the world called "wall_0", ...
+            layout, it has ``WALLS`` boxes per body, geoms of the world called "wall_0", .., and its pairs of geoms are
+            listed (``envs.models.pairs``), since MuJoCo's search would not see that boxes move.
         layout: the maze; its walls in reach are put in place before each control step, which is bit for bit the same
             as with all of them, and costs less. None leaves the model as it is.
         bodies: where in qpos the x of each free body lies.
@@ -70,8 +71,6 @@ class MujocoEngine:
         self._bodies = list(bodies)
         walls = [] if layout is None else [model.geom(f"wall_{k}").id for k in range(WALLS * len(self._bodies))]
         self._wall_geoms = np.asarray(walls, int)
-        world_volumes = model.bvh_nodeid[: model.body_bvhnum[0]]  # the world is the first body
-        self._wall_volumes = np.asarray([np.flatnonzero(world_volumes == geom)[0] for geom in walls], int)
         self._threads = threads or len(os.sched_getaffinity(0))
         self._sensors = sensors
         self._nsensed = sensors.size if sensors else 0
@@ -160,7 +159,7 @@ class MujocoEngine:
             return self._read_sensors(batch).reshape(*lead, self._nsensed)
 
     def _place_walls(self, batch: Batch) -> None:
-        """Moves the boxes, and the volumes that bound them, to the walls around each body.
+        """Moves the boxes to the walls around each body.
 
         They come in the order of the whole maze, in which contacts are solved, and which so decides the last bit. A
         wall near two bodies has one box; boxes without a wall stay out of reach.
@@ -178,7 +177,6 @@ class MujocoEngine:
         height = np.where(index < none, WALL_HALF_SIZE[2], _SUNK)
         centres = np.concatenate([self._layout.index_to_xy(index), height[..., None]], axis=-1)
         batch.expand("geom_pos")[:, self._wall_geoms] = centres
-        batch.expand("bvh_aabb")[:, self._wall_volumes, :3] = centres
 
     def _read_sensors(self, batch: Batch) -> np.ndarray:
         """float32[n, k] of the states that ``batch`` has just made a forward pass of."""

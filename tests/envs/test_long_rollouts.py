@@ -41,6 +41,19 @@ def test_energy_of_a_falling_ant_is_its_weight_and_its_motion() -> None:
     assert falling - resting == pytest.approx(mass * (9.81 * 1.0 + 0.5 * 25), rel=1e-6)
 
 
+def test_rounding_bounds_what_float32_does_to_the_energy() -> None:
+    """Ants with a ball at random, hardly moving: no energy is off by more, and some by a good part of it."""
+    model = envs.make("antsoccer-medium", physics="mujoco").engine.model
+    rng = np.random.default_rng(0)
+    qpos = model.qpos0 + rng.normal(size=(500, model.nq))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    qpos[:, 18:] = model.qpos0[18:]
+    qvel = 1e-6 * rng.normal(size=(500, model.nv))
+    exact, seen = (long_rollouts.energy(model, qpos.astype(d), qvel.astype(d)) for d in (np.float64, np.float32))
+    share = np.abs(seen - exact) / long_rollouts.rounding(model, qpos, qvel)
+    assert 0.2 < share.max() <= 1
+
+
 def test_motors_work_is_torque_times_the_faster_rate() -> None:
     xml = """<mujoco><worldbody><body><joint name="hinge" axis="0 0 1"/><geom size="0.1"/></body></worldbody>
         <actuator><motor joint="hinge" gear="30" ctrlrange="-0.5 0.5"/></actuator></mujoco>"""
