@@ -11,6 +11,7 @@ from qdos_brax.report.parts import Card
 from qdos_brax.report.statistics import mean_curve, probability_of_improvement
 from qdos_brax.report.study import Member, Setting, Study
 
+_ENOUGH = 5  # seeds, below which the bootstrap's interval is far too narrow
 PHASES = ("data", "pretrain", "label", "online", "eval")
 
 
@@ -64,6 +65,8 @@ def _sure(order: list[tuple[Setting, list[float]]]) -> Card:
     chance, low, high = probability_of_improvement([ours], [theirs])
     between = "" if math.isnan(low) else f" (95 % interval: {low:.2f} to {high:.2f})"
     text = f"A seed of {best.label} beats one of {second.label} with a chance of {chance:.2f}{between}."
+    if min(len(ours), len(theirs)) < _ENOUGH and not math.isnan(low):
+        text += " Intervals of so few seeds are too narrow."
     if math.isnan(low):
         return Card(title, "one seed", f"{text} More seeds would say how much that is worth.")
     if low > 0.5:
