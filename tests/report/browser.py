@@ -48,9 +48,9 @@ class Browser:
         """What a script returns once that is true.
 
         Raises:
-            TimeoutError: it does not become so within ten seconds.
+            TimeoutError: it does not become so within a minute.
         """
-        end = time.perf_counter() + 10
+        end = time.perf_counter() + 60
         while time.perf_counter() < end:
             if found := self.run(script):
                 return found
