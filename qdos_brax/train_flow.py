@@ -212,8 +212,8 @@ def _conclude(folder: RunFolder, summary: Mapping[str, Any]) -> None:
 
         try:
             look_inside(folder.path)
-        except UserError as error:  # the page does without
-            print(f"inside    left out: {error}", file=sys.stderr, flush=True)
+        except Exception as error:  # whatever it is: the run is done, and the page does without
+            print(f"inside    left out: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr, flush=True)
     report = write_report([folder.path], folder.path)
     minutes = summary["wall_seconds"]["total"] / 60
     print(f"\ndone in {minutes:.1f} minutes")

@@ -167,6 +167,8 @@ class _LatentView:
             return {}
         artifacts, hyper = of_member(self._trained, member)
         latents = np.asarray(self._posterior(artifacts["skills"], self._segments, self._after).mean)
+        if not np.isfinite(latents).all():  # of a member that was frozen
+            return {}
         found: Arrays = {"latent": latents}
         if len(latents) > _GRID:
             found["tsne"] = _tsne(latents)

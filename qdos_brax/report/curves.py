@@ -18,6 +18,7 @@ from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
 from qdos_brax.report.study import Study, plain, short
 from qdos_brax.runs.folder import replacing
 
+TICKS = 8  # values of a scan that can all be written on its axis
 MEASURES = (("eval/success", "success"), ("eval/return", "return"))
 
 
@@ -50,7 +51,7 @@ def draw_curves(study: Study, out: Path) -> None:
         row[0].set_ylim(-0.02, 1.02)
         if row[0].lines:
             row[0].legend(fontsize="small")
-    _save(figure, out)
+    save(figure, out)
 
 
 def draw_scans(study: Study, out: Path) -> bool:
@@ -61,7 +62,7 @@ def draw_scans(study: Study, out: Path) -> bool:
     figure, axes = plt.subplots(1, len(found), figsize=(5.5 * len(found), 4), layout="constrained", squeeze=False)
     for axis, scan in zip(axes[0], found, strict=True):
         _draw_scan(axis, scan)
-    _save(figure, out)
+    save(figure, out)
     return True
 
 
@@ -90,6 +91,9 @@ def _draw_curve(axis: Axes, curve: Curve, colour: str) -> None:
         axis.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
         for _, xy in curve.members:
             axis.plot(*xy, color=colour, linewidth=0.7, alpha=0.4)
+    for member, xy in curve.members:
+        if member.frozen:
+            axis.plot(*xy[:, -1], "x", color=colour, markersize=9)
 
 
 def _draw_scan(axis: Axes, scan: Scan) -> None:
@@ -97,17 +101,25 @@ def _draw_scan(axis: Axes, scan: Scan) -> None:
         x, _ = positions(line, scan)
         errors = np.nan_to_num(np.stack([line.mean - line.low, line.high - line.mean]))
         label = f"{line.label} (mean, 95 %)"
-        axis.errorbar(x, line.mean, errors, color=colour, marker="o", capsize=3, linewidth=2, label=label)
+        if line.joined:
+            axis.errorbar(x, line.mean, errors, color=colour, marker="o", capsize=3, linewidth=2, label=label)
+        else:
+            axis.plot([], [], "o", color=colour, label=line.label)
         for at, members in zip(x, line.members, strict=True):
             axis.plot([at] * len(members), [m.success for m in members], ".", color=colour, alpha=0.5)
     ticks = sorted({at for line in scan.lines for at in positions(line, scan)[0]})
-    axis.set_xticks(ticks, positions(scan.lines[0], scan)[1] or [plain(tick) for tick in ticks])
+    if scan.wide:
+        axis.set_xscale("log")
+    if len(ticks) <= TICKS:
+        axis.set_xticks(ticks, positions(scan.lines[0], scan)[1] or [plain(tick) for tick in ticks])
+        axis.set_xticks([], minor=True)
     axis.set(xlabel=short(scan.key), ylabel="success at the last evaluation", title=scan.task, ylim=(-0.02, 1.02))
     axis.grid(alpha=0.3)
     axis.legend(fontsize="small")
 
 
-def _save(figure: Figure, out: Path) -> None:
+def save(figure: Figure, out: Path) -> None:
+    """Writes a picture, at once or not at all, and forgets the figure."""
     try:
         with replacing(out) as partial:
             figure.savefig(partial, dpi=120)

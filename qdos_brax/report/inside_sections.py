@@ -1,68 +1,36 @@
-"""The parts of the page that show what a run has learned, from the run folders' inside.npz.
-
-What its arrays are says ``qdos_brax.methods.inside``, which writes it.
-"""
+"""The parts of the page that show what a run has learned: its weights, its latents, its skills, an episode."""
 
 from __future__ import annotations
 
 import base64
+import colorsys
 import io
-import zipfile
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib.image
 import numpy as np
 
-from qdos_brax.errors import UserError
-from qdos_brax.report.parts import PALETTE, Figure, Image, Section, Trace, axes, member_id, numbers
-from qdos_brax.report.study import Member, Run, Study
-from qdos_brax.runs.folder import RunFolder
+from qdos_brax.report.looks import QUALITIES, QUALITY_COLOURS, WALL, Look, by_quality, extent
+from qdos_brax.report.parts import PALETTE, Figure, Image, Section, Trace, axes, logarithmic, member_id, numbers
 
-_QUALITIES = ("good", "noisy", "wandering", "failing")  # by code, as data.quality.QUALITY has them
-_COLOURS = ("#009E73", "#56B4E9", "#E69F00", "#D55E00")  # of these
-_VIRIDIS = ("#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725")
+_COLOUR_BY = ("quality", "progress", "return", "weight")
+_UNKNOWN = "#9aa1aa"  # of what is not known of a segment
+_SQUARE = 430  # pixels, the height of a map
 
 
-class Look(NamedTuple):
-    """What was found of one member.
-
-    Attributes:
-        member: whose it is.
-        label: its setting and seed.
-        data: the arrays that all members of the run share.
-        own: its own arrays.
-    """
-
-    member: Member
-    label: str
-    data: dict[str, np.ndarray]
-    own: dict[str, np.ndarray]
-
-
-def inside_sections(study: Study) -> list[Section]:
+def inside_sections(looks: list[Look]) -> list[Section]:
     """Those that there is something to show in."""
-    looks = [look for run in study.runs for look in _looks(study, run)]
     made = (_weights(looks), _latents(looks), _map(looks), _episodes(looks))
-    return [section for section in made if section.figures]
+    return [section for section in made if section.figures or section.inner]
 
 
-def _looks(study: Study, run: Run) -> Iterator[Look]:
-    file = RunFolder(run.path).inside
-    if not file.is_file():
-        return
-    try:
-        with np.load(file, allow_pickle=False) as content:
-            arrays = {name: content[name] for name in content.files}
-        members = {int(index): run.members[int(index)] for index in arrays["members"]}
-    except (OSError, EOFError, LookupError, ValueError, zipfile.BadZipFile) as error:
-        raise UserError(f"cannot read {file} ({error}); remove it, and --resume {run.path} makes it again") from error
-    shared = {name: array for name, array in arrays.items() if "/" not in name}
-    for index, member in members.items():
-        own = {name.partition("/")[2]: array for name, array in arrays.items() if name.startswith(f"{index}/")}
-        label = next(s.label for s in study.settings if member in s.members.get(member.task, []))
-        several = len(study.tasks) > 1
-        yield Look(member, f"{label}, seed {member.seed}" + (f", {member.task}" if several else ""), shared, own)
+def skill_colours(name: str, count: int) -> list[str]:
+    """Of the paths of a grid of skills: hue by direction from its middle, which is grey; else from blue to orange."""
+    if name == "grid":
+        ticks = np.linspace(-1, 1, round(count**0.5))
+        return [_by_direction(x, y) for y in ticks for x in ticks]
+    first, last = np.array([0, 114, 178]), np.array([230, 159, 0])
+    return [_hex(first + (last - first) * share) for share in np.linspace(0, 1, count)]
 
 
 def _weights(looks: list[Look]) -> Section:
@@ -72,13 +40,16 @@ def _weights(looks: list[Look]) -> Section:
         if "weight" in look.own and "gain" in look.data:
             weight, gain = look.own["weight"], look.data["gain"]
             data = [
-                _dots(gain[chosen], weight[chosen], colour, name, look) for chosen, colour, name in _by_quality(look)
+                _dots(gain[chosen], weight[chosen], colour, name, look) for chosen, colour, name in by_quality(look)
             ]
             layout = axes("units of path to the goal gained", "weight")
-            layout["yaxis"] |= {"type": "log"}
+            layout["yaxis"] |= logarithmic(weight)
             figures.append(Figure(look.label, data, layout))
-    text = "Random segments of the data: the weight of each in skill learning, against the way that it truly made."
-    return Section("Weight against quality", text, figures)
+    text = (
+        "Random segments of the data: the weight of each in skill learning, against the way towards the goal that it "
+        "truly made. A good estimate of quality rises to the right."
+    )
+    return Section("Weight against quality", text, figures=figures)
 
 
 def _latents(looks: list[Look]) -> Section:
@@ -88,20 +59,23 @@ def _latents(looks: list[Look]) -> Section:
             markers = _markers(look)
             x, y = look.own["tsne"].T
             data = _dots(x, y, PALETTE[0], "segment", look) | {"marker": next(iter(markers.values()))}
-            layout = axes("", "") | {"margin": {"l": 20, "r": 10, "t": 45, "b": 20}}
-            buttons = [
-                {"label": name, "method": "restyle", "args": [{"marker": [marker]}]} for name, marker in markers.items()
-            ]
-            place = {"type": "buttons", "active": 0, "direction": "right", "x": 0, "xanchor": "left", "y": 1.16}
-            layout["updatemenus"] = [{"buttons": buttons, **place}]
+            data |= {"customdata": _facts(look), "hovertemplate": "%{customdata}<extra></extra>"}
+            layout = axes("", "") | {"margin": {"l": 14, "r": 10, "t": 14, "b": 14}}
             for axis in ("xaxis", "yaxis"):
                 layout[axis] |= {"showticklabels": False, "zeroline": False}
-            figures.append(Figure(look.label, [data], layout))
+            choices = {name: {"marker": marker} for name, marker in markers.items()}
+            figures.append(Figure(look.label, [data], layout, choices, _SQUARE))
     text = (
-        "The same random segments of the data as each method's encoder sees them, laid out by t-SNE. The buttons "
-        "choose the colour: what produced a segment, the way it made towards the goal, its return, its weight."
+        "The same random segments of the data as each method's encoder sees them, laid out by t-SNE. Choose the "
+        "colour: what produced a segment, the way it made towards the goal, its return, its weight; grey where it is "
+        "not known."
     )
-    return Section("Latents of segments (t-SNE)", text, figures)
+    known = [name for name in _COLOUR_BY if any(name in figure.choices for figure in figures)]
+    plain = {"marker": {"size": 6, "opacity": 0.6, "color": _UNKNOWN, "showscale": False}}
+    for figure in figures:
+        assert isinstance(figure.choices, dict)
+        figure.choices.update({name: plain for name in known if name not in figure.choices})
+    return Section("Latents of segments (t-SNE)", text, figures=figures, choices=known)
 
 
 def _markers(look: Look) -> dict[str, dict[str, Any]]:
@@ -109,17 +83,30 @@ def _markers(look: Look) -> dict[str, dict[str, Any]]:
     found = {}
     common = {"size": 6, "opacity": 0.8}
     if "quality" in look.data:
-        edges = [[at, colour] for i, colour in enumerate(_COLOURS) for at in (i / 4, (i + 1) / 4)]
+        edges = [[at, colour] for i, colour in enumerate(QUALITY_COLOURS) for at in (i / 4, (i + 1) / 4)]
         scale = {"colorscale": edges, "cmin": -0.5, "cmax": 3.5}
-        bar = {"thickness": 10, "tickvals": [0, 1, 2, 3], "ticktext": _QUALITIES}
+        bar = _bar() | {"tickvals": [0, 1, 2, 3], "ticktext": QUALITIES}
         found["quality"] = {**common, **scale, "color": numbers(look.data["quality"]), "colorbar": bar}
-    measures = {"progress": look.data.get("gain"), "return": look.data["return"], "weight": look.own.get("weight")}
-    for name, measure in measures.items():
-        if measure is not None and np.isfinite(measure).any():
+    for name, measure in _measures(look).items():
+        if np.isfinite(measure).any():
             low, high = np.nanquantile(measure, [0.02, 0.98])
             scale = {"colorscale": "Viridis", "cmin": float(low), "cmax": float(high)}
-            found[name] = {**common, **scale, "color": numbers(measure), "colorbar": {"thickness": 10}}
+            found[name] = {**common, **scale, "color": numbers(measure), "colorbar": _bar()}
     return found
+
+
+def _measures(look: Look) -> dict[str, np.ndarray]:
+    """What is known of the segments in numbers."""
+    found = {"progress": look.data.get("gain"), "return": look.data["return"], "weight": look.own.get("weight")}
+    return {name: measure for name, measure in found.items() if measure is not None}
+
+
+def _facts(look: Look) -> list[str]:
+    """Everything that is known of each segment, in words."""
+    words = [[f"{name} {value:.3g}" for value in measure] for name, measure in _measures(look).items()]
+    if "quality" in look.data:
+        words.insert(0, [QUALITIES[code] for code in look.data["quality"]])
+    return ["<br>".join(of_one) for of_one in zip(*words, strict=True)]
 
 
 def _map(looks: list[Look]) -> Section:
@@ -128,32 +115,43 @@ def _map(looks: list[Look]) -> Section:
         for name, words in (("grid", "a grid of skills"), ("between", "from one skill to another")):
             if name in look.own:
                 paths = look.own[name]
-                shades = [_VIRIDIS[i * len(_VIRIDIS) // len(paths)] for i in range(len(paths))]
-                data = [_path(path, shades[i], f"skill {i + 1}", look) for i, path in enumerate(paths)]
-                figures.append(Figure(f"{words}: {look.label}", [*data, _goal(look)], _maze(look)))
+                shades = skill_colours(name, len(paths))
+                data = [_path(path, shades[i], f"skill {i + 1} of {len(paths)}", look) for i, path in enumerate(paths)]
+                figures.append(Figure(f"{words}: {look.label}", [*data, _goal(look)], _maze(look), height=_SQUARE))
     text = (
-        "Each line is one skill, held for three segments' time from the task's start. A grid: along the two directions "
-        "in which latents of the data spread most, to two standard deviations. From one to another: straight between "
-        "the latents of two segments of the data."
+        "Each line is one skill, held for three segments' time from the task's start; its dot is the end. A grid: "
+        "along the two directions in which latents of the data spread most, to two standard deviations; the hue is the "
+        "direction from the grid's middle. From one to another: straight between the latents of two segments of the "
+        "data, from blue to orange. Drag over a part of the maze to enlarge it."
     )
-    return Section("Where skills lead", text, figures)
+    return Section("Where skills lead", text, figures=figures)
 
 
 def _episodes(looks: list[Look]) -> Section:
-    figures, images = [], []
-    for look in looks:
-        left, steps = look.own["left"], look.own.get("frame_steps", np.zeros(0, int))
-        figures.append(_skills_over_time(look))
-        way = _path(np.stack([np.arange(len(left)), left], axis=1), PALETTE[0], "way left", look)
-        marks = _dots(steps, left[steps], PALETTE[1], "picture", look) | {"showlegend": False}
-        layout = axes("environment steps", "units")
-        figures.append(Figure(f"way left to the goal: {look.label}", [way, marks], layout))
-        path = _path(look.own["path"], PALETTE[0], "path", look)
-        figures.append(Figure(f"path: {look.label}", [path, _goal(look)], _maze(look)))
-        for step, frame in zip(steps, look.own.get("frames", ()), strict=True):
-            images.append(Image(f"{look.label}: step {step}", _jpeg(frame)))
-    text = "The first evaluation episode of a member: the latent of every decision, the way left, the path, the scene."
-    return Section("An episode", text, figures, images=images)
+    inner = [_episode(look, opened=i == 0) for i, look in enumerate(looks) if "path" in look.own]
+    text = (
+        "The first evaluation episode of a member: the latent of every decision, the way left to the goal, the path, "
+        "and the scene at the steps that are marked."
+    )
+    return Section("Skills over an episode", text, inner=inner)
+
+
+def _episode(look: Look, opened: bool) -> Section:
+    left, steps = look.own["left"], look.own.get("frame_steps", np.zeros(0, int))
+    way = _path(np.stack([np.arange(len(left)), left], axis=1), PALETTE[0], "way left", look)
+    marks = _dots(steps, left[steps], PALETTE[1], "picture", look) | {"showlegend": False}
+    layout = axes("environment steps", "units of path to the goal")
+    layout["yaxis"] |= {"rangemode": "tozero"}
+    path = _path(look.own["path"], PALETTE[0], "path", look)
+    figures = [
+        _skills_over_time(look),
+        Figure("way left to the goal", [way, marks], layout),
+        Figure("path", [path, _goal(look)], _maze(look), height=_SQUARE),
+    ]
+    images = [
+        Image(f"step {step}", _jpeg(frame)) for step, frame in zip(steps, look.own.get("frames", ()), strict=True)
+    ]
+    return Section(look.label, figures=figures, images=images, opened=opened)
 
 
 def _skills_over_time(look: Look) -> Figure:
@@ -168,26 +166,21 @@ def _skills_over_time(look: Look) -> Figure:
         "colorscale": "RdBu",
         "zmin": -largest,
         "zmax": largest,
-        "colorbar": {"title": {"text": "z"}, "thickness": 10},
+        "colorbar": _bar() | {"title": {"text": "z"}},
         "name": "z",
+        "hovertemplate": "step %{x}, dimension %{y}: %{z:.2f}<extra></extra>",
         "meta": {"member": member_id(look.member)},
     }
     layout = axes("environment steps", "dimension of the latent")
-    return Figure(f"skills over time: {look.label}", [heat], layout)
+    return Figure("skills over time", [heat], layout)
 
 
 # --- Traces ----------------------------------------------------------------------------------------------------
 
 
-def _by_quality(look: Look) -> Iterator[tuple[np.ndarray, str, str]]:
-    """(which segments, colour, name) of every kind of behaviour in the data; one for all where nobody knows."""
-    quality = look.data.get("quality")
-    if quality is None:
-        yield np.ones(len(look.data["return"]), bool), PALETTE[0], "segments"
-        return
-    for code, name in enumerate(_QUALITIES):
-        if (quality == code).any():
-            yield quality == code, _COLOURS[code], name
+def _bar() -> dict[str, Any]:
+    """The scale beside a chart."""
+    return {"thickness": 10, "outlinewidth": 0}
 
 
 def _dots(x: np.ndarray, y: np.ndarray, colour: str, name: str, look: Look) -> Trace:
@@ -197,10 +190,11 @@ def _dots(x: np.ndarray, y: np.ndarray, colour: str, name: str, look: Look) -> T
 
 
 def _path(path: np.ndarray, colour: str, name: str, look: Look) -> Trace:
+    """A line with a dot at its end."""
     x, y = path.T
-    trace = _dots(x, y, colour, name, look) | {"mode": "lines", "line": {"color": colour, "width": 2}}
-    del trace["marker"]
-    return trace | {"showlegend": False}
+    sizes = [0] * (len(path) - 1) + [6]
+    drawn = {"mode": "lines+markers", "line": {"color": colour, "width": 2}, "showlegend": False}
+    return _dots(x, y, colour, name, look) | drawn | {"marker": {"color": colour, "size": sizes, "opacity": 1}}
 
 
 def _goal(look: Look) -> Trace:
@@ -211,18 +205,28 @@ def _goal(look: Look) -> Trace:
 
 def _maze(look: Look) -> dict[str, Any]:
     """A map's layout: one unit as long in x as in y, the walls as grey boxes."""
-    walls = look.data["walls"]
-    half = 0.5 * float(np.diff(np.unique(walls[:, 0])).min())
-    layout = axes("", "")
+    (left, low), (right, high), half = extent(look)
+    layout = axes("", "") | {"margin": {"l": 30, "r": 10, "t": 10, "b": 26}}
     layout["shapes"] = [
         {"type": "rect", "x0": float(x) - half, "x1": float(x) + half, "y0": float(y) - half, "y1": float(y) + half,
-         "fillcolor": "#c3c8ce", "line": {"width": 0}, "layer": "below"}
-        for x, y in walls
+         "fillcolor": WALL, "line": {"width": 0}, "layer": "below"}
+        for x, y in look.data["walls"]
     ]  # fmt: skip
-    (left, low), (right, high) = walls.min(axis=0) - half, walls.max(axis=0) + half
-    layout["xaxis"] |= {"range": [float(left), float(right)], "constrain": "domain"}
+    layout["xaxis"] |= {"range": [float(left), float(right)], "constrain": "domain", "showgrid": False}
     layout["yaxis"] |= {"range": [float(low), float(high)], "scaleanchor": "x", "constrain": "domain"}
+    layout["yaxis"] |= {"showgrid": False, "zeroline": False}
+    layout["xaxis"] |= {"zeroline": False}
     return layout
+
+
+def _by_direction(x: float, y: float) -> str:
+    away = min(1.0, float(np.hypot(x, y)))
+    colour = colorsys.hsv_to_rgb(float(np.arctan2(y, x)) / (2 * np.pi) % 1, 0.85 * away, 0.6 + 0.2 * away)
+    return _hex(np.array(colour) * 255)
+
+
+def _hex(colour: np.ndarray) -> str:
+    return "#" + "".join(f"{round(float(part)):02x}" for part in colour)
 
 
 def _jpeg(frame: np.ndarray) -> str:

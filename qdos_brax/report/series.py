@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -43,12 +44,19 @@ class Scan:
     Attributes:
         task: on which task.
         key: what was varied, dotted.
-        lines: one for each choice of method and of everything else that was varied.
+        lines: one for each choice of method and of everything else that was varied; where no two settings differ in
+            this key alone (values drawn at random, or in pairs), one for each method, not joined.
     """
 
     task: str
     key: str
     lines: list[ScanLine]
+
+    @property
+    def wide(self) -> bool:
+        """Whether the values are positive numbers over a decade or more, and want a logarithmic axis."""
+        values = [value for line in self.lines for value in line.values]
+        return all(map(_is_number, values)) and min(values) > 0 and max(values) >= 10 * min(values)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +70,7 @@ class ScanLine:
         low: the lower end of the mean's 95 % interval; nan for a single member.
         high: its upper end.
         members: the members at each value.
+        joined: whether all else is equal along it.
     """
 
     label: str
@@ -70,6 +79,28 @@ class ScanLine:
     low: np.ndarray
     high: np.ndarray
     members: list[list[Member]]
+    joined: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """Final success over two things that were varied in all combinations, mean over all else.
+
+    Attributes:
+        task: on which task.
+        method: of which method.
+        keys: what was varied, dotted: along x, along y.
+        x: the values of the first, rising.
+        y: of the second.
+        mean: float[y, x]; nan where nothing was evaluated.
+    """
+
+    task: str
+    method: str
+    keys: tuple[str, str]
+    x: list[float]
+    y: list[float]
+    mean: np.ndarray
 
 
 def curves(study: Study, task: str, column: str) -> list[Curve]:
@@ -107,18 +138,49 @@ def scans(study: Study) -> list[Scan]:
                 if key in setting.values:
                     rest = [f"{short(k)} {plain(v)}" for k, v in setting.values.items() if k != key]
                     groups.setdefault(", ".join([setting.method, *rest]), []).append(setting)
-            lines = [_scan_line(label, group, task, key) for label, group in groups.items() if len(group) > 1]
-            if lines:
+            lines = [_scan_line(label, group, task, key, True) for label, group in groups.items() if len(group) > 1]
+            if not lines:
+                drawn: dict[str, list[Setting]] = {}
+                for setting in present:
+                    if key in setting.values:
+                        drawn.setdefault(setting.method, []).append(setting)
+                lines = [_scan_line(method, group, task, key, False) for method, group in drawn.items()]
+            if any(len(line.values) > 1 for line in lines):
                 found.append(Scan(task, key, lines))
     return found
 
 
-def _scan_line(label: str, settings: Sequence[Setting], task: str, key: str) -> ScanLine:
-    if all(isinstance(setting.values[key], int | float) for setting in settings):
+def surfaces(study: Study) -> list[Surface]:
+    """Every pair of keys with numbers for values of which a method has every combination on a task."""
+    found = []
+    for task in study.tasks:
+        for method in dict.fromkeys(setting.method for setting in study.settings):
+            settings = [s for s in study.settings if s.method == method and task in s.members]
+            keys = [
+                k for k in (settings[0].values if settings else ()) if all(_is_number(s.values[k]) for s in settings)
+            ]
+            for first, second in itertools.combinations(keys, 2):
+                x, y = (sorted({s.values[key] for s in settings}) for key in (first, second))
+                cells: dict[tuple[Any, Any], list[float]] = {}
+                for setting in settings:
+                    own = cells.setdefault((setting.values[first], setting.values[second]), [])
+                    own += [m.success for m in setting.members[task] if not math.isnan(m.success)]
+                if min(len(x), len(y)) > 1 and len(cells) == len(x) * len(y):
+                    mean = [[float(np.mean(cells[a, b])) if cells[a, b] else math.nan for a in x] for b in y]
+                    found.append(Surface(task, method, (first, second), x, y, np.asarray(mean)))
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _scan_line(label: str, settings: Sequence[Setting], task: str, key: str, joined: bool) -> ScanLine:
+    if all(_is_number(setting.values[key]) for setting in settings):
         settings = sorted(settings, key=lambda setting: setting.values[key])
     members = [[m for m in setting.members[task] if not math.isnan(m.success)] for setting in settings]
     settings = [setting for setting, group in zip(settings, members, strict=True) if group]
     members = [group for group in members if group]
     ends = [[float(x[0]) for x in mean_curve(np.asarray([[m.success] for m in group]))] for group in members]
     mean, low, high = np.asarray(ends).reshape(-1, 3).T
-    return ScanLine(label, [setting.values[key] for setting in settings], mean, low, high, members)
+    return ScanLine(label, [setting.values[key] for setting in settings], mean, low, high, members, joined)

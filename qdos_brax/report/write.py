@@ -8,7 +8,9 @@ from pathlib import Path
 
 from qdos_brax.errors import UserError
 from qdos_brax.report.curves import draw_curves, draw_scans
+from qdos_brax.report.looks import read_looks
 from qdos_brax.report.page import write_page
+from qdos_brax.report.stills import draw_stills
 from qdos_brax.report.study import read_study
 from qdos_brax.report.tables import Table, first_goal_csv, success_csv, tables
 from qdos_brax.runs.folder import user_errors, write_text
@@ -35,7 +37,7 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) 
     """Writes page, tables (CSV and markdown) and pictures of runs and comparisons.
 
     Args:
-        runs: folders of either kind; all must have ended.
+        runs: folders of either kind; all must have ended. An inside.npz that cannot be read is left out and noted.
         out: the folder for the files, made if it is not there; files of an earlier report in it are replaced.
         reference: the method or label that the others are compared with; None for supe, or else the first.
 
@@ -43,6 +45,8 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) 
         UserError: a folder is no finished run, or something cannot be written.
     """
     study = read_study(runs, reference)
+    looks, missing = read_looks(study)
+    study = dataclasses.replace(study, notes=[*study.notes, *missing])
     with user_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     if not out.is_dir():
@@ -53,6 +57,7 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) 
     files = [page, curves]
     if draw_scans(study, scan):
         files.append(scan)
+    files += draw_stills(study, looks, out)
     for name, text in (
         ("table1.csv", success_csv(study)),
         ("table2.csv", first_goal_csv(study)),
@@ -60,7 +65,7 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) 
     ):
         write_text(out / name, text)
         files.append(out / name)
-    write_page(study, page)
+    write_page(study, looks, page)
     return Report(_text(found, study.notes), page, curves, files)
 
 

@@ -19,6 +19,7 @@ def write_run(
     seeds: Sequence[int] | None = None,
     first_goals: Sequence[int | None] | None = None,
     data: str = "d" * 64,
+    frozen: Sequence[int] = (),
     more: str = "",
 ) -> Path:
     """One finished run.
@@ -31,6 +32,7 @@ def write_run(
         seeds: their numbers; None for 0, 1, ..
         first_goals: by member, seeds first as in a product of seeds and alphas.
         data: SHA-256 of the data file.
+        frozen: members whose numbers were no longer finite.
         more: further lines of config.yaml.
     """
     by_alpha = success if isinstance(success, Mapping) else {0.2: success}
@@ -55,7 +57,7 @@ def write_run(
                     "eval_episodes": 20,
                     "best_success": final,
                     "first_goal_step": goal,
-                    "status": "ok",
+                    "status": "nan" if index in frozen else "ok",
                 }
             )
     alphas = list(by_alpha) if len(by_alpha) > 1 else next(iter(by_alpha))

@@ -1,82 +1,139 @@
-"""The page in a real browser, where there is one: it draws, without an error or a request; hover and filter work."""
+"""The page of a nine-member scan in a real browser, where there is one: mouse, filter, switches, and how it fits."""
 
 from __future__ import annotations
 
-import json
-import re
-import shutil
-import subprocess
-from html import unescape
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from qdos_brax.report.page import write_page
-from qdos_brax.report.study import read_study
+from qdos_brax.report.write import write_report
+from tests.report.browser import CHROMIUM, DRIVER, Browser, browser
 from tests.report.folders import write_run
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-# Runs after the page's own scripts, and leaves what it saw in the document.
-DRIVER = """<script>
-const chart = document.querySelector(".chart");
-const shown = () => chart.data.filter(trace => trace.visible !== false).map(trace => trace.name);
-const seen = {drawn: performance.now(), requests: performance.getEntriesByType("resource").map(entry => entry.name)};
-seen.charts = document.querySelectorAll(".chart .main-svg").length > 0;
-seen.all = shown();
-boxes[0].click();
-seen.without_first = shown();
-families[0].click();
-seen.without_setting = shown();
-families[0].click();
-seen.again = shown();
-document.querySelector("details .chart").closest("details").open = true;
-const last = chart.data.length - 1;
-setTimeout(() => {
-  Plotly.Fx.hover(chart, [{curveNumber: last, pointNumber: 1}]);
-  seen.hover = chart.querySelector(".hoverlayer").textContent;
-  seen.folded = document.querySelector("details .chart .main-svg") !== null;
-  const result = document.createElement("pre");
-  result.id = "seen";
-  result.textContent = JSON.stringify(seen);
-  document.body.append(result);
-}, 500);
-</script>"""
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no Chromium with its driver (Debian: chromium-driver)"),
+]
+ALPHAS = (0.1, 0.2, 0.3)
+MEMBERS = {f"qdos, alpha {alpha}, seed {seed}" for alpha in ALPHAS for seed in range(3)}
+MEANS = {f"qdos, alpha {alpha}" for alpha in ALPHAS}
+# The chart of success over the steps; the name of every curve in it that can be seen.
+CURVES = "[...document.querySelectorAll('.box')].find(b => b.querySelector('h3')?.textContent === 'success')"
+SHOWN = f"return {CURVES}.querySelector('.chart').data.filter(t => t.visible && t.mode).map(t => t.name)"
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-def test_page_in_a_browser(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "q", success={0.1: [0.5, 0.6], 0.3: [0.7, 0.8]}, first_goals=[100, None, 300, 400])
-    write_page(read_study([run]), tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    (tmp_path / "driven.html").write_text(page.replace("</body>", DRIVER + "</body>"), encoding="utf-8")
-    dom, said = browse(tmp_path / "driven.html")
-    assert "CONSOLE" not in said, said
-    seen = json.loads(unescape(re.findall(r'<pre id="seen">(.*?)</pre>', dom)[0]))
-    assert seen["requests"] == [] and seen["charts"] and seen["folded"]
-    members = {f"qdos, alpha {alpha}, seed {seed}" for alpha in (0.1, 0.3) for seed in (0, 1)}
-    means = {"qdos, alpha 0.1", "qdos, alpha 0.3"}
-    assert set(seen["all"]) == members | means
-    assert set(seen["without_first"]) == (members | means) - {"qdos, alpha 0.1, seed 0"}
-    assert set(seen["without_setting"]) == {name for name in members | means if "0.3" in name}
-    assert set(seen["again"]) == members | means
-    assert "37.5%" in seen["hover"] or "0.375" in seen["hover"], seen["hover"]  # the mean of 0.35 and 0.4
-    assert seen["drawn"] < 3000
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three alphas by three seeds, one member frozen, and 600 segments looked at."""
+    folder = tmp_path_factory.mktemp("page")
+    goals = [100, None, 300, 400, 500, 600, None, 800, 900]
+    success = {0.1: [0.5, 0.6, 0.4], 0.2: [0.7, 0.8, 0.9], 0.3: [0.3, 0.2, 0.1]}
+    run = write_run(folder / "scan", success=success, first_goals=goals, frozen=[8])
+    rng = np.random.default_rng(0)
+    segments, grid = 600, [(4.0 * x, 4.0 * y) for x in range(8) for y in range(8) if x in (0, 7) or y in (0, 7)]
+    arrays: dict[str, Any] = {
+        "members": np.arange(3), "goal": np.array([20.0, 20.0]), "walls": np.asarray(grid),
+        "return": rng.normal(size=segments), "gain": rng.normal(size=segments),
+        "quality": rng.integers(0, 4, segments),
+    }  # fmt: skip
+    for i in range(3):
+        own = {
+            "weight": np.exp(rng.normal(size=segments)), "tsne": rng.normal(size=(segments, 2)),
+            "grid": 4 + rng.normal(size=(25, 61, 2)).cumsum(axis=1) / 4,
+            "between": 4 + rng.normal(size=(9, 61, 2)).cumsum(axis=1) / 4,
+            "path": 4 + rng.normal(size=(1001, 2)).cumsum(axis=0) / 9, "left": np.linspace(30, 0, 1001),
+            "latents": rng.normal(size=(50, 8)), "frame_steps": np.linspace(0, 1000, 6).astype(int),
+            "frames": rng.integers(0, 255, (6, 240, 240, 3)).astype(np.uint8),
+        }  # fmt: skip
+        arrays |= {f"{i}/{name}": array for name, array in own.items()}
+    np.savez_compressed(run / "inside.npz", **arrays)
+    return write_report([run], folder / "out").page
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-def test_an_error_in_the_page_would_be_seen(tmp_path: Path) -> None:
-    (tmp_path / "wrong.html").write_text("<script>nonsense()</script>")
-    assert "CONSOLE" in browse(tmp_path / "wrong.html")[1]
+def test_it_opens_at_once(page: Path) -> None:
+    """Wall time, and so of an idle machine."""
+    assert page.stat().st_size < 10_000_000
+    with browser(1280) as window:
+        assert window.open(page) < 3
 
 
-def browse(page: Path) -> tuple[str, str]:
-    """The document after its scripts, and what the browser said."""
-    assert CHROMIUM is not None
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--virtual-time-budget=10000"]
-    size = ["--window-size=1280,2000", f"--user-data-dir={page.parent / 'profile'}"]
-    command = [CHROMIUM, *flags, *size, "--dump-dom", f"file://{page}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    return done.stdout, done.stderr
+def test_page_in_a_browser(page: Path) -> None:
+    with browser(1280) as window:
+        window.open(page)
+        _walk(window)
+        _hover(window)
+        _filter(window)
+        _switch_colours(window)
+        assert window.said() == []
+        requested = window.requested()
+        assert requested and {address[:5] for address in requested} <= {"file:", "data:", "blob:"}
+
+
+@pytest.mark.parametrize("width", [1280, 420])
+@pytest.mark.parametrize("part", ["document.documentElement", "...document.querySelectorAll('.chart')"])
+def test_nothing_hangs_over_the_edge(page: Path, width: int, part: str) -> None:
+    with browser(width) as window:
+        window.open(page)
+        _walk(window)
+        wide = f"return [{part}].filter(x => x.scrollWidth > x.clientWidth + 1).length"
+        assert window.run(wide) == 0
+        assert window.run("return innerWidth") == width and window.said() == []
+
+
+def test_an_error_or_a_request_would_be_seen(tmp_path: Path) -> None:
+    (tmp_path / "wrong.html").write_text("<img src='http://127.0.0.1:9/x.png'><script>nonsense()</script>")
+    with browser(1280) as window:
+        window.open(tmp_path / "wrong.html")
+        assert any("nonsense" in line for line in window.said())
+        assert any(address.startswith("http:") for address in window.requested())
+
+
+def _walk(window: Browser) -> None:
+    """Reads the page down to its end, with every part unfolded: each chart draws itself when it comes near."""
+    window.run("document.querySelectorAll('main details').forEach(part => { part.open = true; })")
+    window.wait("const next = charts.find(c => !c.dataset.drawn); next?.scrollIntoView(); return !next")
+    window.wait("return charts.every(chart => chart.querySelector('.main-svg'))")
+
+
+def _hover(window: Browser) -> None:
+    """The mouse over the mean of alpha 0.2 half way shows its value, the mean of 0.35, 0.4 and 0.45."""
+    at = window.run(
+        f"const chart = {CURVES}.querySelector('.chart'); chart.scrollIntoView({{block: 'center'}});"
+        "const box = chart.getBoundingClientRect(), full = chart._fullLayout;"
+        "return [box.x + full.xaxis._offset + full.xaxis.d2p(2000), box.y + full.yaxis._offset + full.yaxis.d2p(0.4)]"
+    )
+    window.point(at[0] - 30, at[1] - 30)
+    window.point(*at)
+    shown = window.wait(f"return {CURVES}.querySelector('.hoverlayer').textContent")
+    assert "40%" in shown and "alpha 0.2" in shown, shown
+
+
+def _filter(window: Browser) -> None:
+    crossed = {"qdos, alpha 0.3, seed 2 (frozen)"}  # twice: its curve, and the cross at its end
+    everyone = (MEMBERS - {"qdos, alpha 0.3, seed 2"}) | MEANS | crossed
+    assert set(window.run(SHOWN)) == everyone
+    window.click(".filter summary")
+    window.click("input[data-member]")
+    assert set(window.run(SHOWN)) == everyone - {"qdos, alpha 0.1, seed 0"}
+    assert window.run("return document.getElementById('shown').textContent") == "8 of 9"
+    window.click("input[data-setting]")
+    assert {name for name in everyone if "alpha 0.1" not in name} == set(window.run(SHOWN))
+    # What shows hidden members alone goes as a whole: their latents, maps and episodes.
+    assert window.run("return [...document.querySelectorAll('.box[hidden]')].length") >= 4
+    window.click("input[data-setting]")
+    assert set(window.run(SHOWN)) == everyone
+    assert window.run("return [...document.querySelectorAll('.box[hidden]')].length") == 0
+    window.click(".filter summary")
+
+
+def _switch_colours(window: Browser) -> None:
+    """One button changes the colour of every method's latents."""
+    titles = "const chart = document.querySelector('section:has(button) .chart'); return chart.data[0].marker.color[0]"
+    before = window.run(titles)
+    assert before in (0, 1, 2, 3)
+    window.click("button[data-choice=return]")
+    assert window.run(titles) != before
+    pressed = window.run("return [...document.querySelectorAll('button[aria-pressed=true]')].map(b => b.textContent)")
+    assert pressed == ["return"]

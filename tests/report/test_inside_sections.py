@@ -8,13 +8,14 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
-from qdos_brax.errors import UserError
 from qdos_brax.report.inside_sections import inside_sections
+from qdos_brax.report.looks import read_looks
 from qdos_brax.report.page import write_page
 from qdos_brax.report.study import read_study
+from qdos_brax.report.write import write_report
 from tests.report.folders import write_run
 
-TITLES = ["Weight against quality", "Latents of segments (t-SNE)", "Where skills lead", "An episode"]
+TITLES = ["Weight against quality", "Latents of segments (t-SNE)", "Where skills lead", "Skills over an episode"]
 
 
 def write_inside(run: Path, **without: bool) -> None:
@@ -47,8 +48,13 @@ def test_everything_found_is_shown(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", success=[0.5, 0.7])
     write_inside(run)
     study = read_study([run])
-    sections = {section.title: section for section in inside_sections(study)}
-    assert list(sections) == TITLES
+    looks, notes = read_looks(study)
+    sections = {section.title: section for section in inside_sections(looks)}
+    assert list(sections) == TITLES and not notes
+    (episode,) = sections[TITLES[3]].inner
+    assert episode.title == "qdos, seed 1" and episode.opened
+    for figure in episode.figures:
+        go.Figure({"data": figure.data, "layout": figure.layout})
     for section in sections.values():
         for figure in section.figures:
             go.Figure({"data": figure.data, "layout": figure.layout})
@@ -57,42 +63,44 @@ def test_everything_found_is_shown(tmp_path: Path) -> None:
     assert [good["name"], wandering["name"], failing["name"]] == ["good", "wandering", "failing"]
     assert wandering["x"] == [2.0] and wandering["y"] == [pytest.approx(np.exp(2), rel=1e-4)]
     (latents,) = sections[TITLES[1]].figures
-    buttons = {
-        button["label"]: button["args"][0]["marker"][0] for button in latents.layout["updatemenus"][0]["buttons"]
-    }
-    assert list(buttons) == ["quality", "progress", "return", "weight"]
+    buttons = {name: choice["marker"] for name, choice in latents.choices.items()}
+    assert list(buttons) == list(sections[TITLES[1]].choices) == ["quality", "progress", "return", "weight"]
     assert buttons["return"]["color"] == [-float(i) for i in range(8)] and buttons["quality"]["color"][5] == 3
     for marker in buttons.values():
         go.Scatter(marker=marker)
     grid, between = sections[TITLES[2]].figures
     assert (len(grid.data), len(between.data)) == (4 + 1, 3 + 1)  # and the goal
     assert len(grid.layout["shapes"]) == 8 and grid.layout["xaxis"]["range"] == [-2, 10]
-    skills, way, path = sections[TITLES[3]].figures
+    skills, way, path = episode.figures
     assert skills.data[0]["x"] == [0, 20] and skills.data[0]["z"] == [[1, 0], [0, -4], [0, 2]]
     assert way.data[1]["x"] == [0, 40] and way.data[1]["y"] == [9, 1] and len(path.data[0]["x"]) == 41
-    assert [image.title for image in sections[TITLES[3]].images] == ["qdos, seed 1: step 0", "qdos, seed 1: step 40"]
-    write_page(study, tmp_path / "report.html")
+    assert [image.title for image in episode.images] == ["step 0", "step 40"]
+    write_page(study, looks, tmp_path / "report.html")
     assert (tmp_path / "report.html").read_text().count('<img src="data:image/jpeg;base64,') == 2
 
 
 def test_what_was_not_found_is_left_out(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", success=[0.5, 0.7])
-    assert inside_sections(read_study([run])) == []
+    assert read_looks(read_study([run])) == ([], [])
     missing = ["quality", "gain", "1/weight", "1/tsne", "1/grid", "1/between", "1/frames", "1/frame_steps"]
     write_inside(run, **dict.fromkeys(missing, True))
-    (section,) = inside_sections(read_study([run]))
-    assert section.title == "An episode" and not section.images
-    for figure in section.figures:
+    (section,) = inside_sections(read_looks(read_study([run]))[0])
+    assert section.title == TITLES[3] and not section.inner[0].images
+    for figure in section.inner[0].figures:
         go.Figure({"data": figure.data, "layout": figure.layout})
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "text", "foreign", "of more members"])
-def test_damage_is_one_line(tmp_path: Path, damage: str) -> None:
+def test_damage_is_left_out_with_one_line(tmp_path: Path, damage: str) -> None:
     run = write_run(tmp_path / "run")
     contents = {"empty": b"", "cut": b"PK\x03\x04 cut", "text": b"members"}
     if damage in contents:
         (run / "inside.npz").write_bytes(contents[damage])
     else:
         np.savez(run / "inside.npz", **({"other": np.ones(1)} if damage == "foreign" else {"members": np.asarray([3])}))
-    with pytest.raises(UserError, match=r"cannot read .*inside.npz .*remove it, and --resume"):
-        inside_sections(read_study([run]))
+    looks, (note,) = read_looks(read_study([run]))
+    assert looks == [] and "\n" not in note
+    assert "inside.npz" in note and "remove it, and --resume" in note
+    if damage == "cut":
+        report = write_report([run], tmp_path / "out")
+        assert f"note: {note}" in report.text and "remove it, and --resume" in report.page.read_text()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import plotly.graph_objects as go
 import pytest
@@ -22,6 +23,7 @@ class Page(HTMLParser):
         self.elements: list[tuple[str, dict[str, str | None]]] = []
         self.scripts: list[str] = []
         self.words: list[str] = []
+        self.titles: dict[int, str] = {}  # of the charts, by their place
         self._within: list[str] = []
         self.feed(text)
 
@@ -40,6 +42,8 @@ class Page(HTMLParser):
             self.scripts[-1] += text
         else:
             self.words.append(text)
+            if self._within and self._within[-1] == "h3":
+                self.titles[sum("data-figure" in a for _, a in self.elements)] = text
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +54,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Page, int]:
         write_run(folder / "s", "supe", [0.2, 0.4], first_goals=[700, 800]),
         write_run(folder / "q2", success=[0.25, 0.75], env="antsoccer-arena-task4"),
     ]
-    write_page(read_study(runs), folder / "report.html")
+    write_page(read_study(runs), [], folder / "report.html")
     text = (folder / "report.html").read_text(encoding="utf-8")
     return Page(text), len(text.encode())
 
@@ -58,7 +62,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Page, int]:
 def test_nothing_is_fetched(page: tuple[Page, int]) -> None:
     for tag, attributes in page[0].elements:
         for name in ("src", "href", "srcset", "data", "action", "poster"):
-            assert not attributes.get(name) or str(attributes[name]).startswith("data:"), (tag, attributes)
+            assert not attributes.get(name) or str(attributes[name]).startswith(("data:", "#")), (tag, attributes)
     policy = next(a["content"] for t, a in page[0].elements if t == "meta" and a.get("http-equiv"))
     assert policy is not None and "default-src 'none'" in policy and "http" not in policy
     assert page[1] < 10_000_000
@@ -74,16 +78,17 @@ def test_every_figure_is_plotlys_and_has_its_place(page: tuple[Page, int]) -> No
 
 def test_figures_hold_the_runs_numbers(page: tuple[Page, int]) -> None:
     figures = json.loads(page[0].scripts[0])
-    curves = {trace["name"]: trace for trace in figures[0]["data"] if trace.get("mode")}
+    curves = {trace["name"]: trace for trace in _of(page[0], "success, antmaze-medium-task1") if trace.get("mode")}
     assert curves["supe"]["x"] == [1000, 2000, 4000] and curves["supe"]["y"] == [0.075, 0.15, 0.3]
     assert curves["qdos, alpha 0.3, seed 1"]["y"] == [0.2, 0.4, 0.8]
-    goals = sorted(
-        trace["x"][0]
-        for figure in figures
-        for trace in figure["data"]
-        if trace["name"] == "seed 0" and len(trace["x"]) == 1 and trace["x"][0] > 1
-    )
-    assert goals == [100, 700]
+    goals = {
+        (trace["y"][0], trace["name"]): trace["x"][0] for trace in _of(page[0], "every member, antmaze-medium-task1")
+    }
+    assert goals["qdos, alpha 0.1", "seed 0"] == 100 and goals["supe", "seed 1"] == 800
+    assert goals["qdos, alpha 0.3", "seed 0: not reached by then"] == 4000
+    means = {t["y"][0]: t["x"][0] for t in _of(page[0], "every setting, antmaze-medium-task1") if "error_x" in t}
+    assert means == {"qdos, alpha 0.1": 0.55, "qdos, alpha 0.3": 0.75, "supe": 0.3}
+    assert next(iter(means)) == "qdos, alpha 0.3"  # the best is on top
     bars = [trace for figure in figures for trace in figure["data"] if trace.get("type") == "bar"]
     assert {bar["name"]: bar["x"][0] for bar in bars} == {
         "data": 1,
@@ -114,7 +119,30 @@ def test_foreign_names_stay_text(tmp_path: Path) -> None:
     run = write_run(tmp_path / "a", success=[0.5, 0.7])
     summary = json.loads((run / "summary.json").read_text())
     (run / "summary.json").write_text(json.dumps({**summary, "method": evil}))
-    write_page(read_study([run]), tmp_path / "report.html")
+    write_page(read_study([run]), [], tmp_path / "report.html")
     parsed = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert len(parsed.scripts) == 3 and evil in "".join(parsed.words)
-    assert evil in {trace["name"] for trace in json.loads(parsed.scripts[0])[0]["data"]}
+    assert evil in {trace["name"] for trace in _of(parsed, "success")}
+
+
+def test_a_frozen_member_is_marked(tmp_path: Path) -> None:
+    """Where it is filtered, at the end of its curve, and in every chart that has a point of its own for it."""
+    run = write_run(tmp_path / "a", success={0.1: [0.5, 0.6], 0.3: [0.7, 0.8]}, frozen=[2])
+    write_page(read_study([run]), [], tmp_path / "report.html")
+    parsed = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert "".join(parsed.words).count("frozen (NaN)") == 1 and "was frozen" in "".join(parsed.words)
+    for chart, name in (
+        ("success", "qdos, alpha 0.1, seed 1 (frozen)"),
+        ("every setting", "seed 1 (frozen)"),
+        ("success over alpha", "seed 1 (frozen)"),
+    ):
+        crossed = [t for t in _of(parsed, chart) if str(t.get("marker", {}).get("symbol", "")).startswith("x")]
+        assert [trace["name"] for trace in crossed] == [name]
+
+
+def _of(page: Page, title: str) -> list[dict[str, Any]]:
+    """The traces of the first chart with a title."""
+    places = [int(str(a["data-figure"])) for _, a in page.elements if "data-figure" in a]
+    titles = [page.titles.get(i) for i in range(len(places))]
+    data: list[dict[str, Any]] = json.loads(page.scripts[0])[places[titles.index(title)]]["data"]
+    return data

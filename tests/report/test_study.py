@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 
 from qdos_brax import cli
-from qdos_brax.report.series import curves, scans
+from qdos_brax.report.headlines import cards
+from qdos_brax.report.series import curves, scans, surfaces
 from qdos_brax.report.study import read_study
 from qdos_brax.report.tables import tables
 from qdos_brax.report.write import write_report
@@ -92,6 +94,53 @@ def test_scan_by_hand(tmp_path: Path) -> None:
     (line,) = scan.lines
     assert scan.key == "skills.alpha" and line.values == [0.1, 0.3] and line.label == "qdos"
     assert line.mean.tolist() == pytest.approx([0.5, 0.8]) and [len(group) for group in line.members] == [1, 2]
+
+
+def vary(run: Path, **values: list[float]) -> Path:
+    """Gives the members of a run more that was varied."""
+    summary = json.loads((run / "summary.json").read_text())
+    for i, member in enumerate(summary["members"]):
+        member |= {f"skills.{key}": own[i] for key, own in values.items()}
+    (run / "summary.json").write_text(json.dumps(summary))
+    return run
+
+
+def test_values_drawn_at_random_make_no_line(tmp_path: Path) -> None:
+    """No two settings differ in one key alone: their points stand for themselves, on a logarithmic axis."""
+    run = write_run(tmp_path / "a", success={0.1: [0.5], 0.2: [0.7], 0.3: [0.9]})
+    study = read_study([vary(run, kl_weight=[0.02, 3.0, 0.5])])
+    weight, alpha = scans(study)
+    assert (alpha.key, weight.key) == ("skills.alpha", "skills.kl_weight")
+    assert not alpha.wide and weight.wide and not weight.lines[0].joined
+    assert weight.lines[0].values == [0.02, 0.5, 3.0] and weight.lines[0].mean.tolist() == [0.5, 0.9, 0.7]
+    assert surfaces(study) == []
+
+
+def test_every_combination_of_two_makes_a_surface(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "a", success={0.1: [0.2, 0.4], 0.3: [0.6, 0.8]})
+    # The second seed becomes the other value, so that each of the four combinations has one member.
+    study = read_study([vary(run, kl_weight=[1.0, 1.0, 2.0, 2.0])])
+    (surface,) = surfaces(study)
+    assert surface.keys == ("skills.kl_weight", "skills.alpha") and (surface.x, surface.y) == ([1, 2], [0.1, 0.3])
+    assert surface.mean.tolist() == [[0.2, 0.4], [0.6, 0.8]]
+    assert [len(scan.lines) for scan in scans(study)] == [2, 2] and scans(study)[0].lines[0].joined
+
+
+def test_headlines_by_hand(tmp_path: Path) -> None:
+    q = write_run(tmp_path / "q", success=[0.9, 0.8, 1.0], first_goals=[10_000, 20_000, 30_000])
+    s = write_run(tmp_path / "s", "supe", [0.2, 0.4, 0.3], first_goals=[5_000, None, None])
+    best, sure, fastest, time = cards(read_study([q, s]))
+    assert best.value == "qdos" and "90 % (95 % interval of the mean: 80 to 100 %)" in best.text
+    assert sure.value == "ahead of the next" and "chance of 1.00" in sure.text and "too narrow" in sure.text
+    # supe's one seed was faster, but two of its three never got there.
+    assert fastest.value == "qdos" and fastest.text.startswith("20,000 ") and "3 of 3" in fastest.text
+    assert time.value == "13.3 min" and time.text == "6 members: 2.2 min each, 45 % of it online."
+    even = write_run(tmp_path / "e", "supe", [0.9, 0.8, 1.0])
+    best, sure, fastest, _ = cards(read_study([q, even]))
+    assert "2 settings" in best.value and sure.value == "not told apart"
+    nothing = write_run(tmp_path / "n", success=[0.0])
+    best, sure, fastest, _ = cards(read_study([nothing]))
+    assert (best.value, fastest.value) == ("none", "none") and "nothing to compare" in sure.text
 
 
 def test_a_reader_is_warned(tmp_path: Path) -> None:
