@@ -30,8 +30,8 @@ KILLS_OF_A_COMPARISON = 6
 def test_kill_9_at_random_moments(tmp_path: Path, flags: list[str], kills: int) -> None:
     """Runs are killed and gone on with until they end, and new ones begun, until there were enough kills.
 
-    A moment is drawn from the whole time between the first line of the program and its end: collection of the data (each
-    run collects its own), every phase, and the report. Most of a resumed run is behind it, so many runs reach their end.
+    A moment is drawn from the whole time between the first line of the program and its end: collection of the data
+    (each run collects its own), every phase, and the report. Most of a resumed run is behind it, so many runs end.
     """
     seed = int(os.environ.get("QDOS_KILL_SEED") or time.time_ns() % 2**32)
     print(f"QDOS_KILL_SEED={seed}")
