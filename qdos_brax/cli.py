@@ -85,6 +85,7 @@ def train_parser() -> Parser:
     parser.add_argument(
         "--pretrain-steps", metavar="N", help="gradient steps of each thing that is learned from the data alone"
     )
+    parser.add_argument("--wandb", action="store_true", default=None, help="log to Weights & Biases too (extra: wandb)")
     parser.add_argument(
         "--set",
         metavar="KEY=VALUE",
@@ -132,6 +133,7 @@ def configs_from_args(args: argparse.Namespace) -> list[Config]:
         "guide.updates": args.pretrain_steps,
         "hilbert.updates": args.pretrain_steps,
         "diveoff.updates": args.pretrain_steps,
+        "run.wandb": args.wandb,
     }
     flags = {key: value for key, value in by_key.items() if value is not None}
     if args.method is None:

@@ -23,7 +23,7 @@ from qdos_brax.errors import UserError
 from qdos_brax.methods import METHODS
 from qdos_brax.methods.build import build_phases
 from qdos_brax.report.write import Report, write_report
-from qdos_brax.runs import comparison, compile_cache
+from qdos_brax.runs import comparison, compile_cache, observers, signals
 from qdos_brax.runs.folder import RunFolder, new_path, write_text
 from qdos_brax.runs.loop import run_phases
 
@@ -55,11 +55,12 @@ def start(make_configs: Callable[[], Sequence[Config]], preset_given: bool, star
     first = asked[0]
     if first.dataset:
         download.check(first.dataset)
+    observers.check(first.run)
     env = _make_env(first)
     if len(asked) == 1:
         resolved = _resolved(first, env, Path(first.out or _new_path(first, env, first.method)))
         folder = RunFolder.create(str(resolved.out))
-        with folder.held():
+        with folder.held(), signals.stops_at_once(folder.path):
             folder.provenance.unlink(missing_ok=True)  # of an attempt in the same folder that ended before training
             write_text(folder.config, configs.to_yaml(resolved))
             _announce(resolved, first, chosen=not preset_given)
@@ -106,13 +107,14 @@ def _compare(path: Path, started: float, chosen: bool) -> None:
 
 def _go_on(folder: RunFolder, started: float, chosen: bool) -> None:
     """Runs what has not been done yet of a run."""
-    with folder.held():
+    with folder.held(), signals.stops_at_once(folder.path):
         summary = folder.read_summary()
         if summary is not None:
             print(f"{folder.path} has ended already")
             _conclude(folder, summary)
             return
         config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
+        observers.check(config.run)
         env = _make_env(config)
         _announce(config, config, chosen)
         _run(config, env, folder, started)
@@ -145,6 +147,7 @@ def _run(config: Config, env: Any, folder: RunFolder, started: float) -> None:
         checkpoint_seconds=config.run.checkpoint_seconds,
         data_seconds=data_seconds,
         started=started,
+        observers=observers.make(config.run, folder, configs.members(config)),
     )
     _conclude(folder, summary)
 
@@ -176,11 +179,12 @@ def _same_data(folder: RunFolder, data_path: Path) -> None:
     with data_path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if folder.provenance.exists():
-        earlier = json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]
-        if earlier["sha256"] != digest:
-            raise UserError(
-                f"{data_path} is not what the run began with (SHA-256 {digest[:12]}, then {earlier['sha256'][:12]})"
-            )
+        try:
+            earlier = str(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["sha256"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{folder.provenance} is damaged ({error!r}); put it back, or start a new run") from error
+        if earlier != digest:
+            raise UserError(f"{data_path} is not what the run began with (SHA-256 {digest[:12]}, then {earlier[:12]})")
         return
     content = {
         "command": sys.argv,

@@ -321,10 +321,14 @@ class RunConfig:
     Attributes:
         checkpoint_seconds: seconds of work between two checkpoints; 0 saves after every chunk.
         root: folder that holds the run folders whose place is not given with ``--out``.
+        tensorboard: whether TensorBoard's event files are written into the run folder.
+        wandb: whether the same numbers go to Weights & Biases.
     """
 
     checkpoint_seconds: float = number(30.0, scan=False)
     root: str = field("runs", Rule("text"))
+    tensorboard: bool = flag(True)
+    wandb: bool = flag(False)
 
 
 @dataclasses.dataclass(frozen=True)

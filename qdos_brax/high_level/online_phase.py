@@ -12,6 +12,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from flax import struct
 
+from qdos_brax import health
 from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData, MacroRows, Normaliser, macro_rows
 from qdos_brax.high_level import replay as replay_buffer
@@ -137,7 +138,8 @@ class OnlinePhase:
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> OnlinePhaseState:
         """Fresh learners, empty replay, environments at their starts."""
         self._frozen = {name: artifacts.get(name, {}) for name in ("skills", "labels", "guide")}
-        return self._start(key, self._hyper)
+        state = self._start(key, self._hyper)
+        return state.replace(healthy=health.inherited(artifacts, len(key)))
 
     def chunk(self, state: OnlinePhaseState) -> tuple[OnlinePhaseState, dict[str, Any]]:
         """Some iterations, and an evaluation when one is due (always after the last chunk)."""
@@ -162,7 +164,7 @@ class OnlinePhase:
         """Adds the actor and what it needs to see; labels and the guide are done with."""
         kept = {name: value for name, value in artifacts.items() if name not in ("labels", "guide")}
         normaliser = self._normalise.repeated(state.env_steps.shape[0])
-        return kept | {"actor": state.learners.sac.actor, "normaliser": normaliser}
+        return kept | {"actor": state.learners.sac.actor, "normaliser": normaliser, health.KEY: state.healthy}
 
     # --- One member ------------------------------------------------------------------------------------------
 
@@ -207,8 +209,7 @@ class OnlinePhase:
         keys = jax.random.split(update_key, self._config.high_level.num_envs)
         learners, losses = jax.lax.scan(learn, state.learners, keys)
 
-        healthy = state.healthy & _all_finite(learners)
-        learners = jax.tree.map(lambda a, b: jnp.where(healthy, a, b), learners, state.learners)
+        learners, healthy = health.keep_finite(state.healthy, learners, state.learners)
         state = state.replace(
             learners=learners,
             healthy=healthy,
@@ -362,10 +363,6 @@ class OnlinePhase:
 
     def _agent(self, actor: Any, skills: Any, hyper: dict[str, jax.Array]) -> Agent:
         return Agent(self._normalise, self._source, self._sac, hyper["skills.latent_box"], skills, actor)
-
-
-def _all_finite(tree: Any) -> jax.Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
 def high_level_sac(config: Config, observation_dim: int, source: SkillSource) -> SAC:

@@ -12,6 +12,7 @@ import numpy as np
 from brax.envs.base import Env
 from flax import struct
 
+from qdos_brax import health
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.high_level.agent import Player
 from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
@@ -20,7 +21,7 @@ from qdos_brax.population import over_members
 
 
 class OfflinePhaseState(struct.PyTreeNode):
-    """What the phase carries, every leaf [members, ...]: healthy is False once a parameter is not finite."""
+    """What the phase carries, every leaf [members, ...]; healthy: False once a learned number is not finite."""
 
     key: jax.Array
     learner: Any
@@ -97,7 +98,7 @@ class OfflinePhase:
             learner_key, key = jax.random.split(key)
             return OfflinePhaseState(key, self._learner.init(learner_key), jnp.zeros((), jnp.int32), jnp.ones((), bool))
 
-        return jax.jit(jax.vmap(one))(key)
+        return jax.jit(jax.vmap(one))(key).replace(healthy=health.inherited(artifacts, len(key)))
 
     def chunk(self, state: OfflinePhaseState) -> tuple[OfflinePhaseState, dict[str, Any]]:
         """``updates_per_chunk`` gradient steps, and an evaluation when one is due (always after the last chunk)."""
@@ -116,7 +117,8 @@ class OfflinePhase:
     def finish(self, state: OfflinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the learner's parameters under the phase's name, and what observations they were learned on."""
         normaliser = self._normalise.repeated(state.update.shape[0])
-        return artifacts | {self.name: self._learner.params(state.learner), "normaliser": normaliser}
+        learned = {self.name: self._learner.params(state.learner), "normaliser": normaliser}
+        return artifacts | learned | {health.KEY: state.healthy}
 
     def _train(self, state: OfflinePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> Any:
         def update(learner: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
@@ -124,8 +126,6 @@ class OfflinePhase:
 
         keys = jax.random.split(state.key, self._updates + 1)
         learner, info = jax.lax.scan(update, state.learner, keys[1:])
-        finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self._learner.params(learner))])
-        healthy = state.healthy & jnp.all(finite)
-        learner = jax.tree.map(lambda a, b: jnp.where(healthy, a, b), learner, state.learner)
+        learner, healthy = health.keep_finite(state.healthy, learner, state.learner)
         state = OfflinePhaseState(keys[0], learner, state.update + self._updates, healthy)
         return state, jax.tree.map(jnp.mean, info)

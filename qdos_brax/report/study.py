@@ -19,7 +19,14 @@ from qdos_brax.runs.metrics import Row, read_rows
 
 DATA = "data"  # the key under which a setting holds the data file's hash
 # What tells no two settings apart: the names of the task and of the method (they do that themselves), seeds and places.
-_NOT_A_SETTING = {"env", "method", "seed", "out", "dataset", "run.root", "run.checkpoint_seconds"}
+_NOT_A_SETTING = {
+    "env",
+    "method",
+    "seed",
+    "out",
+    "dataset",
+    *(key for key, _ in leaves(Config) if key.startswith("run.")),
+}
 # Where methods that are compared on one task have to agree.
 _BUDGET = ("preset", "physics", "high_level.env_steps", "eval.episodes", DATA)
 _MOST_NAMED = 3

@@ -246,7 +246,7 @@ def choose(store: CheckpointStore, attempt: Callable[[str], T], report: Callable
     for name in store.newest_first():
         try:
             result = attempt(name)
-        except BrokenCheckpoint as error:
+        except (BrokenCheckpoint, OSError, KeyError, TypeError, AttributeError) as error:  # or what it holds is absurd
             reasons.append(f"checkpoint {name} cannot be used: {error}")
             continue
         for reason in reasons:

@@ -14,6 +14,8 @@ from typing import Any
 
 from qdos_brax.errors import UserError
 
+_PARTIAL = ".partial"
+
 
 class RunFolder:
     """One run's folder, held by one process at a time.
@@ -24,6 +26,8 @@ class RunFolder:
         metrics: metrics.csv, one row per member and log point.
         provenance: run.json: the command, the data file's hash, the versions of the packages.
         summary: summary.json, present once the run has ended.
+        tensorboard: folder of TensorBoard's event files.
+        wandb: wandb.json, the run's name at Weights & Biases, if it is logged there.
         inside: inside.npz, what a look inside the finished run found.
         checkpoints: folder of the checkpoints.
     """
@@ -34,6 +38,8 @@ class RunFolder:
         self.provenance = self.path / "run.json"
         self.metrics = self.path / "metrics.csv"
         self.summary = self.path / "summary.json"
+        self.tensorboard = self.path / "tensorboard"
+        self.wandb = self.path / "wandb.json"
         self.inside = self.path / "inside.npz"
         self.checkpoints = self.path / "checkpoints"
 
@@ -51,7 +57,8 @@ class RunFolder:
                     f"{folder.path} holds a run already; go on with --resume {folder.path} or choose another --out"
                 )
             before_training = {folder.config, folder.provenance, folder.checkpoints, folder.path / ".lock"}
-            if folder.path.exists() and set(folder.path.iterdir()) - before_training:
+            found = set(folder.path.iterdir()) if folder.path.exists() else set()
+            if any(path not in before_training and not _is_partial(path) for path in found):
                 raise UserError(f"{folder.path} is not empty; choose another --out")
             folder.checkpoints.mkdir(parents=True, exist_ok=True)
         return folder
@@ -118,7 +125,7 @@ def write_text(path: Path, text: str) -> None:
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A file of the same ending to write to, which takes ``path``'s place at the end; nothing changes on an error."""
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    partial = path.with_name(f".{path.stem}{_PARTIAL}{path.suffix}")
     with user_errors(path):
         try:
             yield partial
@@ -126,6 +133,11 @@ def replacing(path: Path) -> Iterator[Path]:
         finally:
             with contextlib.suppress(OSError):  # of a folder that cannot be written, which is reported already
                 partial.unlink()
+
+
+def _is_partial(path: Path) -> bool:
+    """Whether it is a file that a kill left half written."""
+    return path.name.startswith(".") and _PARTIAL in path.name
 
 
 @contextlib.contextmanager

@@ -6,25 +6,21 @@ constants come again from ``init``, and metrics.csv is cut back to the checkpoin
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import signal
-import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from types import FrameType
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import jax
 import numpy as np
 
 from qdos_brax.errors import UserError
-from qdos_brax.runs import checkpoint
+from qdos_brax.runs import checkpoint, signals
 from qdos_brax.runs.checkpoint import Artifacts, CheckpointStore
 from qdos_brax.runs.folder import RunFolder, write_text
-from qdos_brax.runs.metrics import MetricsTable
+from qdos_brax.runs.live import MemberBoard
+from qdos_brax.runs.metrics import MetricsTable, Observer
 from qdos_brax.runs.progress import Progress
 
 _WALL_PARTS = ("data", "pretrain", "label", "online", "eval")
@@ -90,6 +86,7 @@ def run_phases(
     checkpoint_seconds: float = 30.0,
     data_seconds: float = 0.0,
     started: float | None = None,
+    observers: Sequence[Observer] = (),
 ) -> dict[str, Any]:
     """Runs the phases to their end, from the newest usable checkpoint if there is one.
 
@@ -102,6 +99,7 @@ def run_phases(
         checkpoint_seconds: seconds of work between two checkpoints; 0 saves after every chunk.
         data_seconds: seconds that this process spent on the data.
         started: ``time.perf_counter()`` at this process's start; None for now.
+        observers: are told of every row of metrics.csv.
 
     Returns:
         The summary, as written to summary.json.
@@ -114,12 +112,13 @@ def run_phases(
     table = MetricsTable(folder.metrics, members)
     clock = _Clock(data_seconds, time.perf_counter() if started is None else started)
     keys = _member_keys(members)
-    place = checkpoint.choose(store, lambda name: _restore(name, store, phases, keys, table, clock), _say)
+    place = checkpoint.choose(store, lambda name: _restore(name, store, phases, keys, table, clock), signals.say)
     if place is None:
         table.start()
         place = _Place(0, 0, {}, None)
-    with _signals() as caught:
-        runner = _Runner(folder, store, table, clock, keys, checkpoint_seconds, caught)
+    board = MemberBoard(members)
+    with signals.collected() as caught, table.observed([board, *observers]):
+        runner = _Runner(folder, store, table, clock, keys, checkpoint_seconds, board, caught)
         while place.phase < len(phases):
             place = runner.run(phases[place.phase], place)
     summary = {**header, "wall_seconds": clock.parts(), "members": table.summary()}
@@ -137,6 +136,7 @@ class _Runner:
     clock: _Clock
     keys: jax.Array
     checkpoint_seconds: float
+    board: MemberBoard
     caught: list[int]
 
     def run(self, phase: Phase, place: _Place) -> _Place:
@@ -145,7 +145,7 @@ class _Runner:
         if state is None:
             state = phase.init(_phase_keys(self.keys, place.phase), place.artifacts)
         saved_at, pause = time.monotonic(), self.checkpoint_seconds
-        with Progress(phase.name, phase.num_chunks, place.chunk) as progress:
+        with Progress(phase.name, phase.num_chunks, place.chunk, below=self.board) as progress:
             for chunk in range(place.chunk, phase.num_chunks):
                 state = self._chunk(phase, state, chunk, progress)
                 stop = bool(self.caught)
@@ -194,8 +194,7 @@ class _Runner:
         return max(self.checkpoint_seconds, 20 * save_seconds) if self.checkpoint_seconds else 0.0
 
     def _stop(self) -> None:
-        _say(f"stopped and saved; go on with: python train.py --resume {self.folder.path}")
-        raise SystemExit(128 + self.caught[0])
+        signals.stop(self.caught[0], "stopped and saved", self.folder.path)
 
 
 class _Clock:
@@ -252,27 +251,6 @@ def _restore(
     return _Place(saved.phase, saved.chunk, artifacts, state)
 
 
-@contextlib.contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM instead of dying of the first one; a second one kills."""
-    caught: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield caught  # only the main thread may handle signals
-        return
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        caught.append(number)
-        signal.signal(number, signal.SIG_DFL)
-        _say("stopping after this chunk; once more stops at once")
-
-    handlers = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield caught
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-
-
 def _member_keys(members: Sequence[Mapping[str, Any]]) -> jax.Array:
     """Typed keys[members] from the seeds; members that share a seed share the key and differ in the rest."""
     return jax.vmap(jax.random.key)(np.asarray([member["seed"] for member in members], np.uint32))
@@ -287,7 +265,3 @@ def _mean(values: Any) -> float:
     numbers = np.asarray(values, np.float64)
     numbers = numbers[~np.isnan(numbers)]
     return float(numbers.mean()) if numbers.size else float("nan")
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

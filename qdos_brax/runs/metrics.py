@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,6 +18,22 @@ from qdos_brax.runs.folder import user_errors, write_text
 Row = dict[str, str]
 _FIRST = ("phase", "env_steps", "update", "eval/success", "eval/return")
 _LAST = "sps"
+
+
+class Observer(Protocol):
+    """Someone who is told what is written into metrics.csv, which stays the truth."""
+
+    def begin(self, rows: Sequence[Row]) -> None:
+        """The run begins, or goes on with these rows; what was told of others before does not count any more."""
+        ...
+
+    def append(self, rows: Sequence[Row]) -> None:
+        """A log point: one new row per member, with a cell for each column that it has."""
+        ...
+
+    def end(self) -> None:
+        """The run ends or stops."""
+        ...
 
 
 class MetricsTable:
@@ -36,6 +53,20 @@ class MetricsTable:
         self.columns: list[str] = [*self._members[0], *_FIRST, _LAST]
         self.rows: list[Row] = []
         self._latest: list[dict[str, float]] = [{} for _ in members]
+        self._observers: Sequence[Observer] = ()
+
+    @contextlib.contextmanager
+    def observed(self, observers: Sequence[Observer]) -> Iterator[None]:
+        """Tells the observers of the rows that are there and of those to come."""
+        self._observers = observers
+        try:
+            for observer in observers:
+                observer.begin(self.rows)
+            yield
+        finally:
+            self._observers = ()
+            for observer in observers:
+                observer.end()
 
     def start(self) -> None:
         """Writes the header of a new table."""
@@ -52,7 +83,10 @@ class MetricsTable:
             raise UserError(f"{self._path} has lost rows that the checkpoint counts ({len(table)} of {rows})")
         self.columns = list(columns)
         self.rows, self._latest = [], [{} for _ in self._members]
-        self._add([{name: row[name] for name in columns} for row in table[:rows]])
+        try:
+            self._add([{name: row[name] for name in columns} for row in table[:rows]])
+        except (ValueError, IndexError) as error:
+            raise UserError(f"{self._path} is damaged ({error})") from error
         self._rewrite()
 
     def append(self, phase: str, metrics: Mapping[str, Any], sps: float) -> None:
@@ -77,6 +111,8 @@ class MetricsTable:
         else:
             with user_errors(self._path), self._path.open("a", encoding="utf-8", newline="") as file:
                 file.write(self._text(rows))
+        for observer in self._observers:
+            observer.append(rows)
 
     def latest(self, column: str) -> list[float]:
         """The last number of the column for each member; nan where there was none yet."""
@@ -132,6 +168,23 @@ def read_rows(path: Path) -> list[Row]:
     if "member" not in (reader.fieldnames or ()):
         raise UserError(f"{path} is not a metrics file: it has no column 'member'")
     return list(reader)
+
+
+def measured(row: Row, members: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The numbers of a row by column: without what names the member and the step, and without those that are not there.
+
+    Args:
+        row: of metrics.csv.
+        members: the population; what tells its members apart is no measure.
+    """
+    names = {"member", *members[0], "phase", "env_steps", "update"}
+    numbers = {name: float(cell) for name, cell in row.items() if cell and name not in names}
+    return {name: number for name, number in numbers.items() if not math.isnan(number)}
+
+
+def step_of(row: Row) -> int:
+    """Where on its phase's axis a row stands: environment steps once there are any, else updates."""
+    return int(float(row.get("env_steps") or 0)) or int(float(row.get("update") or 0))
 
 
 def _cell(value: Any) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import optax
 from flax import struct
 
+from qdos_brax import health
 from qdos_brax.config import Config, SkillsConfig
 from qdos_brax.data.device import DeviceData, macro_rows
 from qdos_brax.data.segments import window
@@ -38,13 +39,25 @@ class Rollout(NamedTuple):
 
 
 class SkillPhaseState(struct.PyTreeNode):
-    """What the phase carries, every leaf [members, ...]."""
+    """What the phase carries, every leaf [members, ...].
+
+    Attributes:
+        key: typed key.
+        params: of the skill model.
+        moments: Adam's, of ``params``.
+        weights: what the segment weights learn.
+        update: gradient steps so far.
+        broken: rollouts whose simulation broke; they are left out.
+        healthy: False once a number that is learned stopped being finite; the member is frozen from then on.
+    """
 
     key: jax.Array
     params: Any
     moments: optax.OptState
     weights: Any
     update: jax.Array
+    broken: jax.Array
+    healthy: jax.Array
 
 
 class SkillPhase:
@@ -91,26 +104,38 @@ class SkillPhase:
             model_key, weights_key, key = jax.random.split(key, 3)
             params = self._model.init(model_key)
             return SkillPhaseState(
-                key, params, ADAM.init(params), self._weights.init(weights_key), jnp.zeros((), jnp.int32)
+                key=key,
+                params=params,
+                moments=ADAM.init(params),
+                weights=self._weights.init(weights_key),
+                update=jnp.zeros((), jnp.int32),
+                broken=jnp.zeros((), jnp.int32),
+                healthy=jnp.ones((), bool),
             )
 
         self._artifacts = {name: artifacts[name] for name in ("advantage",) if name in artifacts}
-        return jax.vmap(one)(key)
+        return jax.vmap(one)(key).replace(healthy=health.inherited(artifacts, len(key)))
 
     def chunk(self, state: SkillPhaseState) -> tuple[SkillPhaseState, dict[str, np.ndarray]]:
         """``blocks_per_chunk`` x ``mi_every`` gradient steps."""
         state, info = self._chunk(state, self._hyper, self._artifacts, self._data)
-        return state, {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+        metrics = {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+        if self._information is not None:
+            metrics["broken_envs"] = np.asarray(state.broken)
+        return state, metrics | {"status_ok": np.asarray(state.healthy)}
 
     def finish(self, state: SkillPhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the skill model's parameters; the weights' own are done with."""
-        return artifacts | {"skills": state.params}
+        return artifacts | {"skills": state.params, health.KEY: state.healthy}
 
     def _train(self, state: SkillPhaseState, hyper: Any, artifacts: Any, data: DeviceData) -> Any:
         keys = jax.random.split(state.key, self._blocks + 1)
         block = partial(self._block, data=data, hyper=hyper, artifacts=artifacts)
-        state, info = jax.lax.scan(block, state, keys[1:])
-        return state.replace(key=keys[0]), jax.tree.map(jnp.mean, info)
+        after, info = jax.lax.scan(block, state, keys[1:])
+        learned, healthy = health.keep_finite(state.healthy, _learned(after), _learned(state))
+        params, moments, weights = learned
+        state = after.replace(key=keys[0], params=params, moments=moments, weights=weights, healthy=healthy)
+        return state, jax.tree.map(jnp.mean, info)
 
     def _block(
         self, state: SkillPhaseState, key: jax.Array, data: DeviceData, hyper: Any, artifacts: Any
@@ -125,7 +150,11 @@ class SkillPhase:
             starts = data.starts[index]
             observations = self._information(state.params, data, starts, latent)
             weight = self._weight(state, self._batch(state, data, index, hyper), artifacts, hyper)
-            rollout = Rollout(observations, latent, weight)
+            # One simulation that broke must not cost the member: it is counted, and weighs nothing.
+            finite = jnp.all(jnp.isfinite(observations), axis=(1, 2))
+            observations = jnp.where(finite[:, None, None], observations, 0.0)
+            rollout = Rollout(observations, latent, jnp.where(finite, weight, 0.0))
+            state = state.replace(broken=state.broken + jnp.sum(~finite).astype(jnp.int32))
         update = partial(self._update, data=data, hyper=hyper, artifacts=artifacts, rollout=rollout)
         return jax.lax.scan(update, state, jax.random.split(update_key, self._skills.mi_every))
 
@@ -166,3 +195,7 @@ class SkillPhase:
     def _weight(self, state: SkillPhaseState, batch: SegmentBatch, artifacts: Any, hyper: Any) -> jax.Array:
         advantage = self._weights.advantage(state.weights, batch, artifacts)
         return advantage_weights(advantage, hyper["skills.advantage_temperature"], hyper["skills.weight_clip"])
+
+
+def _learned(state: SkillPhaseState) -> tuple[Any, Any, Any]:
+    return state.params, state.moments, state.weights

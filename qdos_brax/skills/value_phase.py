@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from qdos_brax import health
 from qdos_brax.config import Config, SkillsConfig, ValuesConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import macro_return, window
@@ -22,11 +23,12 @@ LABEL_BATCH = 2048
 
 
 class ValuePhaseState(struct.PyTreeNode):
-    """What the phase carries, every leaf [members, ...]."""
+    """What the phase carries, every leaf [members, ...]: healthy is False once a number of the values is not finite."""
 
     key: jax.Array
     values: ValueState
     update: jax.Array
+    healthy: jax.Array
 
 
 class ValuePhase:
@@ -60,18 +62,20 @@ class ValuePhase:
 
         def one(key: jax.Array) -> ValuePhaseState:
             init_key, key = jax.random.split(key)
-            return ValuePhaseState(key, self._iql.init(init_key), jnp.zeros((), jnp.int32))
+            return ValuePhaseState(key, self._iql.init(init_key), jnp.zeros((), jnp.int32), jnp.ones((), bool))
 
-        return jax.vmap(one)(key)
+        return jax.vmap(one)(key).replace(healthy=health.inherited(artifacts, len(key)))
 
     def chunk(self, state: ValuePhaseState) -> tuple[ValuePhaseState, dict[str, np.ndarray]]:
         """``updates_per_chunk`` gradient steps."""
         state, info = self._chunk(state, self._hyper, self._data)
-        return state, {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+        metrics = {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+        return state, metrics | {"status_ok": np.asarray(state.healthy)}
 
     def finish(self, state: ValuePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the scaled advantage of every segment, float32[members, S]."""
-        return artifacts | {"advantage": self._advantages(state, self._hyper, self._data)}
+        advantage = self._advantages(state, self._hyper, self._data)
+        return artifacts | {"advantage": advantage, health.KEY: state.healthy}
 
     def _train(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> Any:
         value_hyper = ValueHyper(hyper["values.learning_rate"], hyper["values.expectile"], hyper["values.target_rate"])
@@ -82,7 +86,8 @@ class ValuePhase:
 
         keys = jax.random.split(state.key, self._updates + 1)
         values, info = jax.lax.scan(update, state.values, keys[1:])
-        state = ValuePhaseState(keys[0], values, state.update + self._updates)
+        values, healthy = health.keep_finite(state.healthy, values, state.values)
+        state = ValuePhaseState(keys[0], values, state.update + self._updates, healthy)
         return state, jax.tree.map(jnp.mean, info)
 
     def _all_advantages(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> jax.Array:

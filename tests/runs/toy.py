@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from flax import struct
 
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
+from qdos_brax.runs.metrics import Observer
 
 MEMBERS = [{"seed": seed, "alpha": alpha} for seed in (0, 7) for alpha in (0.1, 0.3)]
 ADAM = optax.adam(1e-2)
@@ -112,7 +114,12 @@ def phases(sleep: float = 0.0) -> list[ToyPhase]:
     return [ToyPhase("pretrain", 5, sleep), ToyPhase("label", 0), ToyPhase("online", 6, sleep)]
 
 
-def run(path: Path, toy_phases: list[ToyPhase] | None = None, checkpoint_seconds: float = 0.0) -> dict[str, Any]:
+def run(
+    path: Path,
+    toy_phases: list[ToyPhase] | None = None,
+    checkpoint_seconds: float = 0.0,
+    observers: Sequence[Observer] = (),
+) -> dict[str, Any]:
     """Runs the toy in ``path``, or goes on with it."""
     if path.exists():
         folder = RunFolder.open(path)
@@ -128,6 +135,7 @@ def run(path: Path, toy_phases: list[ToyPhase] | None = None, checkpoint_seconds
             header=HEADER,
             checkpoint_seconds=checkpoint_seconds,
             data_seconds=0.5,
+            observers=observers,
         )
 
 
