@@ -22,6 +22,7 @@ from qdos_brax.data import cache, download, formats
 from qdos_brax.errors import UserError
 from qdos_brax.methods import METHODS
 from qdos_brax.methods.build import build_phases
+from qdos_brax.population import Population
 from qdos_brax.report.write import Report, write_report
 from qdos_brax.runs import comparison, compile_cache
 from qdos_brax.runs.folder import RunFolder, new_path, write_text
@@ -137,7 +138,7 @@ def _run(config: Config, env: Any, folder: RunFolder, started: float) -> None:
     _same_data(folder, data_path)
     data_seconds = time.perf_counter() - before_data
     summary = run_phases(
-        build_phases(config, env, dataset),
+        build_phases(config, env, dataset, Population(configs.population_hyper(config))),
         folder,
         configs.members(config),
         config=configs.config_hash(config),
