@@ -22,6 +22,7 @@ from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
 from qdos_brax.high_level.sac import SAC, Batch, Reference, SACHyper, SACState
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
+from qdos_brax.memory import working_bytes
 from qdos_brax.population import Population
 from qdos_brax.skills.source import SkillSource
 
@@ -157,6 +158,10 @@ class OnlinePhase:
             "status_ok": np.asarray(state.healthy),
         }
         return state, metrics
+
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._frozen, self._hyper, self._data)
 
     def finish(self, state: OnlinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the actor and what it needs to see; labels and the guide are done with."""

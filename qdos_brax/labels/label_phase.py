@@ -12,6 +12,7 @@ from flax import struct
 from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import window
+from qdos_brax.memory import working_bytes
 from qdos_brax.networks import gaussian_sample
 from qdos_brax.population import Population
 from qdos_brax.skills.source import SkillSource
@@ -66,6 +67,10 @@ class LabelPhase:
         """Labels the next ``chunk_size`` segments."""
         state, _ = self._chunk(state, self._skills, self._hyper, self._data)
         return state, {"update": np.asarray(state.position)}
+
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._skills, self._hyper, self._data)
 
     def finish(self, state: LabelPhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the labels, float32[members, S, width]."""

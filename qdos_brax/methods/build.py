@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 
 import envs
 from qdos_brax import config as configs
+from qdos_brax import memory
 from qdos_brax.config import Config
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, Normaliser, to_device
@@ -83,6 +84,19 @@ def build_phases(config: Config, env: Any, dataset: Dataset, population: Populat
             None if guide is None else guide.jump_start,
         ),
     ]
+
+
+def plan_members(config: Config, env: Any, dataset: Dataset, members: Sequence[Mapping[str, Any]]) -> memory.Plan:
+    """How the members run on this process's devices, by an estimate of their memory.
+
+    Raises:
+        UserError: the data cannot serve this configuration.
+    """
+    one = Population(configs.population_hyper(config, members[:1]))
+    shared = sum(value.nbytes for value in vars(dataset).values() if isinstance(value, np.ndarray))
+    need = memory.estimate(build_phases(config, env, dataset, one), shared)
+    devices = jax.local_devices()
+    return memory.plan(need, len(members), devices, memory.room_of(devices[0]), config.members_per_program)
 
 
 def make_source(config: Config, env: Any) -> SkillSource:
@@ -335,7 +349,9 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
         agent = trained.agent(artifacts, hyper)
         return evaluate(trained.env, agent.choose, agent.play, key, episodes, trained.config.skills.horizon)
 
-    result = Population(trained.hyper).program(play)(trained.artifacts, trained.hyper, evaluation_key())
+    result = Population(trained.hyper, trained.config.members_per_program).program(play)(
+        trained.artifacts, trained.hyper, evaluation_key()
+    )
     means = {
         "success": np.asarray(result.success).mean(axis=-1),
         "return": np.asarray(result.episode_return).mean(axis=-1),

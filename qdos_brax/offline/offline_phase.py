@@ -15,6 +15,7 @@ from flax import struct
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.high_level.agent import Player
 from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
+from qdos_brax.memory import working_bytes
 from qdos_brax.offline.learner import Learner
 from qdos_brax.population import Population
 
@@ -109,6 +110,10 @@ class OfflinePhase:
             episodes = self._evaluate(self._learner.params(state.learner), keys, self._data)
             metrics |= summary(episodes) | {"eval_seconds": time.perf_counter() - started}
         return state, metrics
+
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._hyper, self._data)
 
     def finish(self, state: OfflinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the learner's parameters under the phase's name, and what observations they were learned on."""

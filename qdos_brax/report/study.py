@@ -20,6 +20,8 @@ from qdos_brax.runs.metrics import Row, read_rows
 DATA = "data"  # the key under which a setting holds the data file's hash
 # What tells no two settings apart: the names of the task and of the method (they do that themselves), seeds and places.
 _NOT_A_SETTING = {"env", "method", "seed", "out", "dataset", "run.root", "run.checkpoint_seconds"}
+# How members were found and run; what differs for it is among the values.
+_NOT_A_SETTING |= {"scan.combine", "scan.samples", "scan.draw_seed", "members_per_program"}
 # Where methods that are compared on one task have to agree.
 _BUDGET = ("preset", "physics", "high_level.env_steps", "eval.episodes", DATA)
 _MOST_NAMED = 3

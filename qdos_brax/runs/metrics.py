@@ -76,7 +76,7 @@ class MetricsTable:
             self._rewrite()
         else:
             with user_errors(self._path), self._path.open("a", encoding="utf-8", newline="") as file:
-                file.write(self._text(rows))
+                file.write(_text(self.columns, rows))
 
     def latest(self, column: str) -> list[float]:
         """The last number of the column for each member; nan where there was none yet."""
@@ -109,12 +109,12 @@ class MetricsTable:
         self.rows += rows
 
     def _rewrite(self) -> None:
-        write_text(self._path, ",".join(self.columns) + "\n" + self._text(self.rows))
+        write_rows(self._path, self.columns, self.rows)
 
-    def _text(self, rows: Sequence[Row]) -> str:
-        text = io.StringIO()
-        csv.DictWriter(text, self.columns, restval="", lineterminator="\n").writerows(rows)
-        return text.getvalue()
+
+def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
+    """Writes a whole table at once."""
+    write_text(path, ",".join(columns) + "\n" + _text(columns, rows))
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -132,6 +132,12 @@ def read_rows(path: Path) -> list[Row]:
     if "member" not in (reader.fieldnames or ()):
         raise UserError(f"{path} is not a metrics file: it has no column 'member'")
     return list(reader)
+
+
+def _text(columns: Sequence[str], rows: Sequence[Row]) -> str:
+    text = io.StringIO()
+    csv.DictWriter(text, columns, restval="", lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def _cell(value: Any) -> str:

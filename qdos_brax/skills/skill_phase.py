@@ -15,6 +15,7 @@ from qdos_brax.config import Config, SkillsConfig
 from qdos_brax.data.device import DeviceData, macro_rows
 from qdos_brax.data.segments import window
 from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.memory import working_bytes
 from qdos_brax.population import Population
 from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
 from qdos_brax.skills.vae import Segments, SkillModel
@@ -95,6 +96,10 @@ class SkillPhase:
         """``blocks_per_chunk`` x ``mi_every`` gradient steps."""
         state, info = self._chunk(state, self._hyper, self._artifacts, self._data)
         return state, {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._hyper, self._artifacts, self._data)
 
     def finish(self, state: SkillPhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the skill model's parameters; the weights' own are done with."""

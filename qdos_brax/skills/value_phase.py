@@ -14,6 +14,7 @@ from flax import struct
 from qdos_brax.config import Config, SkillsConfig, ValuesConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import macro_return, window
+from qdos_brax.memory import working_bytes
 from qdos_brax.population import Population
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState
 from qdos_brax.skills.weights import scaled_advantage, segment_advantage, transition_advantage
@@ -64,6 +65,10 @@ class ValuePhase:
         """``updates_per_chunk`` gradient steps."""
         state, info = self._chunk(state, self._hyper, self._data)
         return state, {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._hyper, self._data)
 
     def finish(self, state: ValuePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the scaled advantage of every segment, float32[members, S]."""
