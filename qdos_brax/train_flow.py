@@ -60,21 +60,23 @@ def start(
     first = next(iter(asked.values()))
     if first.dataset:
         download.check(first.dataset)
+    env = _make_env(first)
     if hosts.count > 1 and len(asked) > 1:
         raise UserError("--distributed shares the members of one run; give one method and one value of each size")
-    if hosts.index:
-        folder = parts.await_creation(Path(str(first.out)))
-        _run(configs.replace(configs.from_yaml(folder.config), out=str(folder.path)), folder, started, hosts)
-        return
-    env = _make_env(first)
     if len(asked) == 1:
         resolved = _resolved(first, env, Path(first.out or _new_path(first, env, first.method)))
+        count = len(configs.members(resolved))
+        if count < hosts.count:
+            raise UserError(f"--distributed: {hosts.count} processes cannot share {count} members; use fewer")
+        if hosts.index:
+            folder = parts.await_creation(Path(str(resolved.out)))
+            _run(configs.from_yaml(folder.config), folder, started, hosts)
+            return
         folder = RunFolder.create(str(resolved.out))
         with folder.held():
             folder.provenance.unlink(missing_ok=True)  # of an attempt in the same folder that ended before training
             write_text(folder.config, configs.to_yaml(resolved))
             if hosts.count > 1:
-                _check_share(resolved, hosts)
                 parts.create(folder, hosts.count, configs.to_yaml(resolved))
             _announce(resolved, first, chosen=not preset_given)
             _run(resolved, folder, started, hosts)
@@ -131,7 +133,7 @@ def _compare(path: Path, started: float, chosen: bool) -> None:
 def _go_on(folder: RunFolder, started: float, chosen: bool, hosts: Hosts = ALONE) -> None:
     """Runs what has not been done yet of a run."""
     if hosts.index:
-        _run(configs.replace(configs.from_yaml(folder.config), out=str(folder.path)), folder, started, hosts)
+        _run(configs.from_yaml(folder.config), folder, started, hosts)
         return
     with folder.held():
         summary = folder.read_summary()
@@ -153,14 +155,6 @@ def _resolved(asked: Config, env: Any, path: Path) -> Config:
 
 def _new_path(config: Config, env: Any, name: str) -> Path:
     return new_path(config.run.root, f"{env.spec.full_name}-{name}")
-
-
-def _check_share(config: Config, hosts: Hosts) -> None:
-    count = len(configs.members(config))
-    if count < hosts.count:
-        raise UserError(
-            f"--distributed: {hosts.count} processes cannot share {count} members; give more seeds or values"
-        )
 
 
 def _run(config: Config, folder: RunFolder, started: float, hosts: Hosts = ALONE) -> None:

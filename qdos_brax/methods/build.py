@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,11 @@ from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
 
 
-def build_phases(config: Config, env: Any, dataset: Dataset, population: Population) -> list[Phase]:
+class RunPhase(Phase, memory.Sized, Protocol):
+    """A phase that the loop can run, and whose memory is known before."""
+
+
+def build_phases(config: Config, env: Any, dataset: Dataset, population: Population) -> list[RunPhase]:
     """The phases of ``config.method``, in order.
 
     Args:
@@ -130,14 +134,14 @@ class _Source(NamedTuple):
     """A kind of low-level behaviour: how it is made, and the phases that learn it."""
 
     make: Callable[[Config, Any], SkillSource]
-    phases: Callable[[_Task], list[Phase]]
+    phases: Callable[[_Task], list[RunPhase]]
 
 
 def _trajectory_source(config: Config, env: Any) -> SkillSource:
     return TrajectorySource(_skill_model(config, env), config.high_level.latent_map)
 
 
-def _trajectory_phases(task: _Task) -> list[Phase]:
+def _trajectory_phases(task: _Task) -> list[RunPhase]:
     config, recipe, env, data = task.config, task.recipe, task.env, task.data
     if recipe.weighted and config.values.n_step > config.skills.horizon:
         raise UserError(
@@ -168,7 +172,7 @@ def _direction_source(config: Config, env: Any) -> SkillSource:
     return DirectionSource(learner.latent_dim, learner.direction, learner.act)
 
 
-def _direction_phases(task: _Task) -> list[Phase]:
+def _direction_phases(task: _Task) -> list[RunPhase]:
     return [_offline_phase(task, "skills", _hilbert(task.config, task.env), task.config.hilbert.updates)]
 
 
@@ -189,7 +193,7 @@ def _transition_source(config: Config, env: Any) -> SkillSource:
     return TransitionSource(learner, learner.encode, config.high_level.latent_map)
 
 
-def _transition_phases(task: _Task) -> list[Phase]:
+def _transition_phases(task: _Task) -> list[RunPhase]:
     return [_offline_phase(task, "skills", _diveoff(task.config, task.env), task.config.diveoff.updates)]
 
 
@@ -349,9 +353,8 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
         agent = trained.agent(artifacts, hyper)
         return evaluate(trained.env, agent.choose, agent.play, key, episodes, trained.config.skills.horizon)
 
-    result = Population(trained.hyper, trained.config.members_per_program).program(play)(
-        trained.artifacts, trained.hyper, evaluation_key()
-    )
+    program = Population(trained.hyper, trained.config.members_per_program).program(play)
+    result = program(trained.artifacts, trained.hyper, evaluation_key())
     means = {
         "success": np.asarray(result.success).mean(axis=-1),
         "return": np.asarray(result.episode_return).mean(axis=-1),
