@@ -25,6 +25,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, macro_rows, to_device
 from qdos_brax.data.segments import window
 from qdos_brax.methods.build import value_phase
+from qdos_brax.population import Population
 from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.segment_weights import LatentWeights, SegmentBatch
 from qdos_brax.skills.skill_phase import SkillPhase
@@ -59,21 +60,21 @@ def scores(
 ) -> dict[str, Scores]:
     """By advantage, those of ``advantages`` that ``config.values.estimator`` has; as scaled by the configuration."""
     found: dict[str, Scores] = {}
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    population = Population(configs.population_hyper(config))
     for name in advantages:
         if name not in CONFIGURED[config.values.estimator]:
             continue
         chosen = configs.replace(config, **{"skills.advantage": name})
         if name == "transition" or not found:  # segment and latent share their values
             started = time.perf_counter()
-            phase = value_phase(chosen, env, dataset, data, hyper)
+            phase = value_phase(chosen, env, dataset, data, population)
             state = run_phase(phase, seed, {})
             artifacts = phase.finish(state, {})
             seconds = time.perf_counter() - started
             fit = correlation(env, dataset, state_values(chosen, env, data, phase, state))
         score = np.asarray(artifacts["advantage"][0])
         if name == "latent":
-            score = latent_scores(chosen, env, data, hyper, artifacts, seed)
+            score = latent_scores(chosen, env, data, population, artifacts, seed)
         found[name] = Scores(score, fit, seconds)
     return found
 
@@ -97,19 +98,19 @@ def correlation(env: Any, dataset: Dataset, values: np.ndarray) -> float:
 
 
 def latent_scores(
-    config: configs.Config, env: Any, data: DeviceData, hyper: Any, artifacts: Any, seed: int
+    config: configs.Config, env: Any, data: DeviceData, population: Population, artifacts: Any, seed: int
 ) -> np.ndarray:
     """Q(s_0, z) - V(s_0) of every segment, after a skill phase without rollouts in which Q learned along."""
     skills = config.skills
     model = SkillModel(env.observation_size, env.action_size, skills.latent_dim, skills.encoder_hidden,
                        skills.encoder_layers, skills.decoder_hidden, skills.prior_hidden)  # fmt: skip
     weights = LatentWeights(env.observation_size, skills.latent_dim, config.values.hidden, skills.advantage_scale)
-    learned = run_phase(SkillPhase(config, data, hyper, model, weights, None), seed, artifacts)
+    learned = run_phase(SkillPhase(config, data, population, model, weights, None), seed, artifacts)
     learned = jax.tree.map(lambda x: x[0], learned)
 
     @jax.jit
     def latent(index: jax.Array) -> jax.Array:
-        rows = macro_rows(data, data.starts[index], skills.horizon, hyper["values.discount"][0])
+        rows = macro_rows(data, data.starts[index], skills.horizon, population.hyper["values.discount"][0])
         segments = Segments(*window((data.observations, data.actions), data.starts[index], skills.horizon))
         batch = SegmentBatch(index, rows, lambda: model.encode(learned.params, segments).mean)
         return weights.smaller_head(learned.weights, batch)

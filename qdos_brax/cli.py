@@ -7,11 +7,12 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 from qdos_brax import __version__
-from qdos_brax.config import Config, load_config, nearest, presets
+from qdos_brax.config import Config, load_programs, nearest, presets
 from qdos_brax.errors import UserError
 from qdos_brax.methods import METHODS
 
@@ -86,13 +87,35 @@ def train_parser() -> Parser:
         "--pretrain-steps", metavar="N", help="gradient steps of each thing that is learned from the data alone"
     )
     parser.add_argument("--wandb", action="store_true", default=None, help="log to Weights & Biases too (extra: wandb)")
+    parser.add_argument("--zip", action="store_true", help="pair the lists of a scan instead of taking their product")
+    parser.add_argument(
+        "--sample",
+        metavar="N",
+        help="draw N settings at random, from lists and from values such as skills.alpha=loguniform(0.1,3) or "
+        "uniform(a,b), each with every seed",
+    )
+    parser.add_argument(
+        "--members-per-program",
+        metavar="N",
+        help="members of a scan that a device trains at once; the others wait their turn (default: chosen, and said)",
+    )
     parser.add_argument(
         "--set",
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="any key of the configuration, such as skills.kl_weight=0.2; may be given again and again",
+        help="any key of the configuration, such as skills.kl_weight=0.2, or 0.1,0.2 to scan it; sizes take lists too, "
+        "one program each (skills.horizon=4,20); may be given again and again",
     )
+    parser.add_argument(
+        "--distributed",
+        action="store_true",
+        help="share the members with other processes that run the same command on a common --out or --resume; found by "
+        "the variables of Slurm, Open MPI or Kubernetes, or by the three flags below",
+    )
+    parser.add_argument("--coordinator", metavar="HOST:PORT", help="where the first process can be met")
+    parser.add_argument("--processes", metavar="N", type=_positive, help="how many processes there are")
+    parser.add_argument("--process-id", metavar="I", type=_index, help="the number of this one, from 0")
     parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
     return parser
 
@@ -114,8 +137,8 @@ def _flags(parser: argparse.ArgumentParser) -> list[str]:
     return flags
 
 
-def configs_from_args(args: argparse.Namespace) -> list[Config]:
-    """The configurations that the flags of ``train.py`` ask for: one per method.
+def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:
+    """The configurations that the flags of ``train.py`` ask for, by name: one per method and per choice of sizes.
 
     Raises:
         UserError: a value is wrong.
@@ -126,6 +149,9 @@ def configs_from_args(args: argparse.Namespace) -> list[Config]:
         "out": args.out,
         "dataset": args.dataset,
         "physics": args.physics,
+        "scan.combine": "zip" if args.zip else None,
+        "scan.samples": args.sample,
+        "members_per_program": args.members_per_program,
         "high_level.env_steps": args.steps,
         "values.updates": args.pretrain_steps,
         "skills.updates": args.pretrain_steps,
@@ -136,28 +162,45 @@ def configs_from_args(args: argparse.Namespace) -> list[Config]:
         "run.wandb": args.wandb,
     }
     flags = {key: value for key, value in by_key.items() if value is not None}
-    if args.method is None:
-        return [load_config(args.env, args.preset, flags, args.set)]
-    methods = [name.strip() for name in args.method.split(",")]
+    methods = [Config.method] if args.method is None else [name.strip() for name in args.method.split(",")]
     for name in methods:
         if methods.count(name) > 1:
             raise UserError(f"--method holds {name!r} twice: {args.method}")
-    return [load_config(args.env, args.preset, {**flags, "method": name}, args.set) for name in methods]
+    found: dict[str, Config] = {}
+    for method in methods:
+        for sizes, config in load_programs(args.env, args.preset, {**flags, "method": method}, args.set).items():
+            found["_".join(part for part in (method if len(methods) > 1 else "", sizes) if part) or method] = config
+    return found
 
 
 def _train(args: argparse.Namespace, started: float) -> int:
-    given = [name for name, value in vars(args).items() if name != "resume" and value]
+    meeting = ("distributed", "coordinator", "processes", "process_id")
+    given = [name for name, value in vars(args).items() if name not in ("resume", *meeting) and value]
     if args.resume is not None and given:
         raise UserError(f"--resume goes on with the run's own config.yaml; leave out --{given[0].replace('_', '-')}")
     if args.resume is None and args.env is None:
         raise UserError("give a task with --env (python -m qdos_brax tasks lists them), or a run to --resume")
 
-    from qdos_brax import train_flow  # here, so that --help and a wrong flag answer at once
+    if not args.distributed:
+        for name in meeting:
+            if getattr(args, name) is not None and name != "distributed":
+                raise UserError(f"--{name.replace('_', '-')} is for a run of several processes; give --distributed too")
+    elif args.resume is None and args.out is None:
+        raise UserError("--distributed needs a folder that all processes know; give --out or --resume")
 
+    from qdos_brax import train_flow  # here, so that --help and a wrong flag answer at once
+    from qdos_brax.hosts import ALONE, join
+
+    hosts = ALONE
+    if args.distributed:
+        if args.resume is None:
+            train_flow.check_new(args.out)
+        hosts = join(args.coordinator, args.processes, args.process_id)
     if args.resume is None:
-        train_flow.start(lambda: configs_from_args(args), preset_given=args.preset is not None, started=started)
+        asked = partial(configs_from_args, args)
+        train_flow.start(asked, preset_given=args.preset is not None, started=started, hosts=hosts)
     else:
-        train_flow.resume(args.resume, started=started)
+        train_flow.resume(args.resume, started=started, hosts=hosts)
     return 0
 
 
@@ -279,6 +322,12 @@ def _positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1, not {text!r}")
     return number
+
+
+def _index(text: str) -> int:
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0, not {text!r}")
+    return int(text)
 
 
 def _guarded(work: Callable[[], int | None]) -> int:

@@ -1,11 +1,99 @@
-"""The member axis: seeds and hyperparameter values, the first axis of everything that learns."""
+"""The member axis: seeds and hyperparameter values, the first axis of everything that learns.
+
+A phase writes its programs for one member; a ``Population`` makes programs of all members from them. One call of the
+compiled program trains a group: some members at once on each device. More groups than one take turns on it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec, SingleDeviceSharding
+
+_AXIS = "members"
+
+
+class Population:
+    """The members of a run, and how what is written for one of them is run for all.
+
+    With one member at a time on each device, a member's numbers do not depend on its company: the compiled program is
+    that of a run of the member alone.
+
+    Args:
+        hyper: scannable numbers by dotted key, float32[members] each.
+        per_program: members that one device trains at once; 0 for as many as there are.
+        devices: to spread the members over; None for the default one alone.
+        parked: whether the members' states wait for their turn in host memory.
+    """
+
+    def __init__(
+        self,
+        hyper: Mapping[str, Any],
+        per_program: int = 0,
+        devices: Sequence[jax.Device] | None = None,
+        parked: bool = False,
+    ) -> None:
+        self.members = len(next(iter(hyper.values())))
+        devices = list(devices or jax.local_devices()[:1])[: -(-self.members // (per_program or 1))]
+        self.turns = -(-self.members // ((per_program or self.members) * len(devices)))
+        self.per_program = -(-self.members // (self.turns * len(devices)))
+        self.devices = devices[: -(-self.members // (self.turns * self.per_program))]
+        self._slots = self.per_program * len(self.devices)
+        self._mesh = jax.sharding.Mesh(np.asarray(self.devices), (_AXIS,))
+        self._takes_turns = parked or self._slots != self.members
+        self._spread = NamedSharding(self._mesh, PartitionSpec(_AXIS))
+        self._home = SingleDeviceSharding(jax.local_devices(backend="cpu")[0] if parked else self.devices[0])
+        self.hyper = {key: jnp.asarray(value) for key, value in hyper.items()}
+
+    def shared(self, tree: Any) -> Any:
+        """What all members read (the data set), on every device."""
+        return tree if len(self.devices) == 1 else jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec()))
+
+    def program(self, function: Callable[..., Any], carries: bool = False) -> Callable[..., Any]:
+        """``function(*member_trees, shared)`` of one member, compiled for trees with a leading member axis.
+
+        Args:
+            function: its last argument is what all members share, the others are one member's own.
+            carries: whether its first argument is a state that is given up (donated) for the first of its results.
+        """
+        compiled = jax.jit(self._over_devices(function), donate_argnums=0 if carries else ())
+        if self._takes_turns:
+            return partial(self._in_turn, compiled, carries)
+        if len(self.devices) == 1:
+            return compiled
+        return lambda *args: compiled(*jax.device_put(args[:-1], self._spread), args[-1])
+
+    def _over_devices(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        group = over_members(function, self.per_program)
+        if len(self.devices) == 1:
+            return group
+
+        def sharded(*args: Any) -> Any:
+            own = PartitionSpec(_AXIS)
+            specs = (*(own for _ in args[1:]), PartitionSpec())
+            return jax.shard_map(group, mesh=self._mesh, in_specs=specs, out_specs=own, check_vma=False)(*args)
+
+        return sharded
+
+    def _in_turn(self, compiled: Callable[..., Any], carries: bool, *args: Any) -> Any:
+        own, shared = args[:-1], args[-1]
+        results = []
+        for first in range(0, self.members, self._slots):
+            # Slots beyond the last member are filled with it, and what becomes of them is dropped.
+            index = np.minimum(np.arange(first, first + self._slots), self.members)
+            result = compiled(*jax.device_put(_take(own, index), self._spread), shared)
+            result = jax.device_put(result, self._home)
+            if carries:
+                state, result = result
+                own = (_put(own[0], state, index), *own[1:])
+            results.append(result)
+        joined = jax.tree.map(lambda *parts: jnp.concatenate(parts)[: self.members], *results)
+        return (own[0], joined) if carries else joined
 
 
 def over_members(function: Callable[..., Any], members: int) -> Callable[..., Any]:
@@ -27,3 +115,15 @@ def over_members(function: Callable[..., Any], members: int) -> Callable[..., An
         return jax.vmap(lambda *own: function(*own, args[-1]))(*args[:-1])
 
     return single if members == 1 else mapped
+
+
+@jax.jit
+def _take(tree: Any, index: jax.Array) -> Any:
+    """The members at ``index``; the last one for what lies beyond."""
+    return jax.tree.map(lambda leaf: leaf[jnp.minimum(index, leaf.shape[0] - 1)], tree)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _put(tree: Any, members: Any, index: jax.Array) -> Any:
+    """``tree`` with ``members`` at ``index``, but for what lies beyond."""
+    return jax.tree.map(lambda leaf, part: leaf.at[index].set(part, mode="drop"), tree, members)

@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,12 @@ from qdos_brax import config as configs
 from qdos_brax.config import Config
 from qdos_brax.data import cache, download, formats
 from qdos_brax.errors import UserError
+from qdos_brax.hosts import ALONE, Hosts
 from qdos_brax.methods import METHODS
-from qdos_brax.methods.build import build_phases
+from qdos_brax.methods.build import build_phases, plan_members
+from qdos_brax.population import Population
 from qdos_brax.report.write import Report, write_report
-from qdos_brax.runs import comparison, compile_cache, observers, signals
+from qdos_brax.runs import comparison, compile_cache, observers, parts, signals
 from qdos_brax.runs.folder import RunFolder, new_path, write_text
 from qdos_brax.runs.loop import run_phases
 
@@ -38,41 +40,55 @@ def prepare_jax() -> None:
     compile_cache.enable()
 
 
-def start(make_configs: Callable[[], Sequence[Config]], preset_given: bool, started: float) -> None:
+def start(
+    make_configs: Callable[[], Mapping[str, Config]], preset_given: bool, started: float, hosts: Hosts = ALONE
+) -> None:
     """A new run to its end; of several configurations a comparison, one run after another.
 
     Args:
-        make_configs: reads the configurations, which differ in their method; called once jax may be asked for its
-            devices.
+        make_configs: reads the configurations by name, which differ in method or sizes; called once jax may be asked
+            for its devices.
         preset_given: whether the user named the preset; if not, the first lines say why it was taken.
         started: ``time.perf_counter()`` at the process's start.
+        hosts: the processes that share the run.
 
     Raises:
         UserError: a flag, a file or the disk is at fault.
     """
     prepare_jax()
     asked = make_configs()
-    first = asked[0]
+    first = next(iter(asked.values()))
     if first.dataset:
         download.check(first.dataset)
     observers.check(first.run)
     env = _make_env(first)
+    if hosts.count > 1 and len(asked) > 1:
+        raise UserError("--distributed shares the members of one run; give one method and one value of each size")
     if len(asked) == 1:
         resolved = _resolved(first, env, Path(first.out or _new_path(first, env, first.method)))
+        count = len(configs.members(resolved))
+        if count < hosts.count:
+            raise UserError(f"--distributed: {hosts.count} processes cannot share {count} members; use fewer")
+        if hosts.index:
+            folder = parts.await_creation(Path(str(resolved.out)))
+            _run(configs.from_yaml(folder.config), folder, started, hosts)
+            return
         folder = RunFolder.create(str(resolved.out))
         with folder.held(), signals.stops_at_once(folder.path):
             folder.provenance.unlink(missing_ok=True)  # of an attempt in the same folder that ended before training
             write_text(folder.config, configs.to_yaml(resolved))
+            if hosts.count > 1:
+                parts.create(folder, hosts.count, configs.to_yaml(resolved))
             _announce(resolved, first, chosen=not preset_given)
-            _run(resolved, env, folder, started)
+            _run(resolved, folder, started, hosts)
         return
     path = Path(first.out or _new_path(first, env, "comparison"))
-    members = {config.method: _resolved(config, env, path / config.method) for config in asked}
-    comparison.create(path, {method: configs.to_yaml(config) for method, config in members.items()})
+    runs = {name: _resolved(config, _make_env(config), path / name) for name, config in asked.items()}
+    comparison.create(path, {name: configs.to_yaml(config) for name, config in runs.items()})
     _compare(path, started, chosen=not preset_given)
 
 
-def resume(path: str, started: float) -> None:
+def resume(path: str, started: float, hosts: Hosts = ALONE) -> None:
     """Goes on with the run or the comparison in ``path`` to its end.
 
     Raises:
@@ -82,31 +98,44 @@ def resume(path: str, started: float) -> None:
     if comparison.is_comparison(path):
         _compare(Path(path), started, chosen=False)
     else:
-        _go_on(RunFolder.open(path), started, chosen=False)
+        _go_on(RunFolder.open(path), started, chosen=False, hosts=hosts)
+
+
+def check_new(path: str) -> None:
+    """Refuses a folder that cannot hold a new run; every process does, before they meet.
+
+    Raises:
+        UserError: there is something at ``path``.
+    """
+    if Path(path).exists() and any(Path(path).iterdir()):
+        raise UserError(f"{path} is not empty; go on with --resume {path}, or choose another --out")
 
 
 def _compare(path: Path, started: float, chosen: bool) -> None:
     """Runs what has not ended yet of a comparison, and reports on the whole."""
     with RunFolder(path).held():
         folders = comparison.runs(path)
-        for number, (method, folder) in enumerate(folders.items(), 1):
-            print(f"\n--- {method}, {number} of {len(folders)} methods", flush=True)
+        for number, (name, folder) in enumerate(folders.items(), 1):
+            print(f"\n--- {name}, {number} of {len(folders)} runs", flush=True)
             try:
                 _go_on(folder, started, chosen)
             except UserError as error:
-                raise UserError(f"{method}: {error} (then: python train.py --resume {path})") from error
+                raise UserError(f"{name}: {error} (then: python train.py --resume {path})") from error
             except SystemExit:  # a signal; the run has been saved and has said how to go on with it alone
                 print(f"and with the whole comparison: python train.py --resume {path}", file=sys.stderr, flush=True)
                 raise
-            jax.clear_caches()  # the next method's programs are others
+            jax.clear_caches()  # the next run's programs are others
             started = time.perf_counter()
         report = write_report([path], path)
     print(f"\n{report.text}\n\ncompared {', '.join(folders)}")
     _say_files(report)
 
 
-def _go_on(folder: RunFolder, started: float, chosen: bool) -> None:
+def _go_on(folder: RunFolder, started: float, chosen: bool, hosts: Hosts = ALONE) -> None:
     """Runs what has not been done yet of a run."""
+    if hosts.index:
+        _run(configs.from_yaml(folder.config), folder, started, hosts)
+        return
     with folder.held(), signals.stops_at_once(folder.path):
         summary = folder.read_summary()
         if summary is not None:
@@ -115,9 +144,8 @@ def _go_on(folder: RunFolder, started: float, chosen: bool) -> None:
             return
         config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
         observers.check(config.run)
-        env = _make_env(config)
         _announce(config, config, chosen)
-        _run(config, env, folder, started)
+        _run(config, folder, started, hosts)
 
 
 def _resolved(asked: Config, env: Any, path: Path) -> Config:
@@ -131,25 +159,53 @@ def _new_path(config: Config, env: Any, name: str) -> Path:
     return new_path(config.run.root, f"{env.spec.full_name}-{name}")
 
 
-def _run(config: Config, env: Any, folder: RunFolder, started: float) -> None:
+def _run(config: Config, folder: RunFolder, started: float, hosts: Hosts = ALONE) -> None:
+    """Trains the members, or this process's share of them; the first process concludes."""
+    shares = parts.parts_of(folder)
+    if not shares:
+        _conclude(folder, _train(config, folder, configs.members(config), started))
+        return
+    for index in range(hosts.index, len(shares), hosts.count):
+        part = shares[index]
+        with part.held():
+            if part.read_summary() is None:
+                own = configs.replace(configs.from_yaml(part.config), out=str(part.path))
+                _train(own, part, parts.share_of(configs.members(own), index, len(shares)), started)
+    if hosts.index == 0:
+        for part in shares:
+            parts.await_end(part)
+        ended = [(part, configs.config_hash(configs.from_yaml(part.config))) for part in shares]
+        write_text(folder.provenance, shares[0].provenance.read_text(encoding="utf-8"))
+        _conclude(folder, parts.merge(folder, ended, configs.config_hash(config)))
+
+
+def _train(config: Config, folder: RunFolder, members: list[dict[str, Any]], started: float) -> dict[str, Any]:
+    """Trains ``members`` in a run folder to their end; the summary."""
+    env = _make_env(config)
     before_data = time.perf_counter()
     data_path = formats.data_file(download.resolve(config.dataset) if config.dataset else _default_data(config, env))
     print(f"data      {data_path}", flush=True)
     dataset = formats.read(data_path, env)
     _same_data(folder, data_path)
     data_seconds = time.perf_counter() - before_data
-    summary = run_phases(
-        build_phases(config, env, dataset),
+    found = plan_members(config, env, dataset, members)
+    print(f"members   {found.line}", flush=True)
+    if config.members_per_program != found.per_program:
+        config = configs.replace(config, members_per_program=found.per_program)
+        write_text(folder.config, configs.to_yaml(config))
+    hyper = configs.population_hyper(config, members)
+    population = Population(hyper, found.per_program, jax.local_devices(), found.parked)
+    return run_phases(
+        build_phases(config, env, dataset, population),
         folder,
-        configs.members(config),
+        members,
         config=configs.config_hash(config),
         header={"env": config.env, "method": config.method, "preset": config.preset, "physics": config.physics},
         checkpoint_seconds=config.run.checkpoint_seconds,
         data_seconds=data_seconds,
         started=started,
-        observers=observers.make(config.run, folder, configs.members(config)),
+        observers=observers.make(config.run, folder, members),
     )
-    _conclude(folder, summary)
 
 
 def _make_env(config: Config) -> Any:

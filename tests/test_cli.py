@@ -59,7 +59,7 @@ def test_wrong_flags_are_one_line(
 def test_flags_reach_the_configuration() -> None:
     flags = "--env antsoccer --alpha 0.1,0.3 --seed 0,1 --method supe --preset smoke --physics mujoco --out o"
     more = "--dataset d.npz --steps 4000 --pretrain-steps 70 --set skills.kl_weight=0.2 --set eval.episodes=3"
-    (config,) = cli.configs_from_args(cli.train_parser().parse_args(shlex.split(f"{flags} {more}")))
+    (config,) = cli.configs_from_args(cli.train_parser().parse_args(shlex.split(f"{flags} {more}"))).values()
     assert (config.env, config.method, config.preset, config.physics) == ("antsoccer", "supe", "smoke", "mujoco")
     assert (config.out, config.dataset, config.seed) == ("o", "d.npz", (0, 1))
     assert config.skills.alpha == (0.1, 0.3) and config.skills.kl_weight == 0.2

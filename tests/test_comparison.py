@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from qdos_brax import cli, train_flow
+from qdos_brax import cli, memory, train_flow
 from qdos_brax.errors import UserError
 from qdos_brax.methods import inside
 from qdos_brax.runs import comparison
@@ -41,7 +41,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     data.write_bytes(b"the same for all")
     built: list[str] = []
 
-    def phases(config: Any, env: Any, dataset: Any) -> list[toy.ToyPhase]:
+    def phases(config: Any, env: Any, dataset: Any, population: Any) -> list[toy.ToyPhase]:
         built.append(config.method)
         kind = DyingPhase if config.out.endswith("killed/supe") and built.count("supe") == 1 else toy.ToyPhase
         return [kind(phase.name, phase.num_chunks) for phase in toy.phases()]
@@ -49,6 +49,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(train_flow, "_default_data", lambda config, env: data)
     monkeypatch.setattr(train_flow.formats, "read", lambda path, env: None)
     monkeypatch.setattr(train_flow, "build_phases", phases)
+    monkeypatch.setattr(train_flow, "plan_members", lambda *args: memory.Plan(1, False, "toys"))
     monkeypatch.setattr(inside, "look_inside", lambda path: None)  # toys have nothing inside
     monkeypatch.setattr(train_flow.jax, "clear_caches", lambda: None)  # the other tests' programs are theirs
     return built
@@ -85,8 +86,8 @@ def test_killed_comparison_goes_on_exactly(
 
 def test_alpha_is_not_scanned_where_it_weighs_nothing(tmp_path: Path, built: list[str]) -> None:
     configs = cli.configs_from_args(cli.train_parser().parse_args(shlex.split(f"{command()} --alpha 0.1,0.3")))
-    env = train_flow._make_env(configs[0])
-    alphas = [train_flow._resolved(config, env, tmp_path).skills.alpha for config in configs]
+    env = train_flow._make_env(configs["qdos"])
+    alphas = [train_flow._resolved(config, env, tmp_path).skills.alpha for config in configs.values()]
     assert alphas == [(0.1, 0.3), 0.0]
 
 

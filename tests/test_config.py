@@ -154,6 +154,88 @@ def test_members_are_the_product() -> None:
         configs.hyper_tree(config)
 
 
+def test_zip_pairs_lists_and_seeds() -> None:
+    config = load_config("antsoccer", "cpu", {"scan.combine": "zip", "skills.alpha": "0.1,0.1,0.3", "seed": "0,1,0"})
+    assert [tuple(member.values()) for member in configs.members(config)] == [(0, 0.1), (1, 0.1), (0, 0.3)]
+    paired = load_config(
+        "antsoccer", "cpu", {"scan.combine": "zip", "skills.alpha": "0.1,0.3"}, ["skills.kl_weight=1,2"]
+    )
+    assert [(m["seed"], m["alpha"], m["skills.kl_weight"]) for m in configs.members(paired)] == [
+        (0, 0.1, 1),
+        (0, 0.3, 2),
+    ]
+
+
+def test_samples_are_drawn_once_and_repeat(tmp_path: Path) -> None:
+    flags = {"scan.samples": "5", "seed": "3,4"}
+    sets = ["skills.alpha=loguniform(0.01,1)", "values.expectile=uniform(0.7, 0.9)", "skills.kl_weight=0.1,0.2"]
+    config = load_config("antsoccer", "cpu", flags, sets)
+    assert config == load_config("antsoccer", "cpu", flags, sets)
+    found = configs.members(config)
+    assert len(found) == 10 and [member["seed"] for member in found] == 5 * [3] + 5 * [4]
+    assert [{**member, "seed": 3} for member in found[5:]] == found[:5]
+    for member in found:
+        assert 0.01 <= member["alpha"] <= 1 and 0.7 <= member["values.expectile"] <= 0.9
+        assert member["skills.kl_weight"] in (0.1, 0.2)
+    path = tmp_path / "config.yaml"
+    path.write_text(configs.to_yaml(config))
+    assert configs.members(configs.from_yaml(path)) == found  # nothing is drawn again
+    assert configs.members(load_config("antsoccer", "cpu", flags, [*sets, "scan.draw_seed=1"])) != found
+    one_more = load_config("antsoccer", "cpu", flags, [*sets, "values.discount=uniform(0.9,0.99)"])
+    assert one_more.skills.alpha == config.skills.alpha
+    many = load_config("antsoccer", "cpu", {"scan.samples": 2000}, ["skills.alpha=loguniform(0.1,10)"]).skills.alpha
+    assert abs(np.mean(np.asarray(many) < 1) - 0.5) < 0.04  # half of the draws below the geometric middle
+
+
+def test_sizes_make_programs() -> None:
+    sets = ["skills.horizon=10,20", "high_level.hidden=[[64,64],[128,128]]", "skills.alpha=0.1,0.2"]
+    programs = configs.load_programs("antmaze", "cpu", sets=sets)
+    assert list(programs) == [
+        "horizon-10_hidden-64-64",
+        "horizon-10_hidden-128-128",
+        "horizon-20_hidden-64-64",
+        "horizon-20_hidden-128-128",
+    ]
+    last = programs["horizon-20_hidden-128-128"]
+    assert (last.skills.horizon, last.high_level.hidden, last.skills.alpha) == (20, (128, 128), (0.1, 0.2))
+    both = configs.load_programs("antmaze", "cpu", sets=["policy.hidden=[[8],[16]]", "values.hidden=[[8],[16]]"])
+    assert "values.hidden-16_policy.hidden-8" in both
+    words = configs.load_programs(
+        "antmaze", "cpu", sets=["skills.kl_weighted=true,false", "skills.advantage_scale=std,rank"]
+    )
+    assert [config.skills.kl_weighted for config in words.values()] == [True, True, False, False]
+    assert list(configs.load_programs("antmaze", "cpu", sets=["high_level.hidden=64,64"])) == [""]
+
+
+@pytest.mark.parametrize(
+    ("flags", "sets", "message"),
+    [
+        ({"scan.combine": "zip", "skills.alpha": "0.1,0.2", "seed": "0,1,2"}, [], "lists of one length"),
+        ({"scan.combine": "zip", "skills.alpha": "0.1,0.1", "seed": "0,0"}, [], "the same member twice"),
+        ({"scan.combine": "zip"}, ["skills.horizon=10,20"], "skills.horizon shapes the program"),
+        ({"scan.combine": "zip", "scan.samples": "2"}, ["skills.alpha=uniform(0,1)"], "leave out --zip"),
+        ({"scan.samples": "2"}, [], "nothing to draw"),
+        ({"scan.samples": "3"}, ["skills.alpha=0.1,0.2"], "more settings than there are"),
+        ({"scan.samples": "x"}, ["skills.alpha=0.1,0.2"], "scan.samples must be a whole number"),
+        ({}, ["skills.alpha=uniform(0,1)"], "drawn from with --sample N"),
+        ({"scan.samples": "2"}, ["skills.alpha=normal(0,1)"], "no distribution 'normal'"),
+        ({"scan.samples": "2"}, ["skills.alpha=loguniform(0,1)"], "wants 0 < a < b"),
+        ({"scan.samples": "2"}, ["skills.alpha=uniform(2,1)"], "wants a < b"),
+        ({"scan.samples": "2"}, ["skills.alpha=uniform(a,1)"], "must be a number"),
+        ({"scan.samples": "9"}, ["values.expectile=uniform(0.5,9)"], "at most 1"),
+        ({"seed": "1,1"}, [], "seed holds the same value twice"),
+        ({}, ["skills.horizon=10,10"], "asked for twice"),
+        ({}, ["skills.horizon=10,x"], "whole number"),
+        ({}, ["high_level.hidden=64,64;32,32"], "several lists of widths"),
+        ({"members_per_program": "-1"}, [], "at least 0"),
+    ],
+)
+def test_wrong_scans_are_one_line(flags: dict[str, str], sets: list[str], message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        configs.load_programs("antmaze", "paper", flags, sets)
+    assert "\n" not in str(caught.value)
+
+
 def test_hyper_holds_what_can_be_scanned_and_no_more() -> None:
     tree = configs.hyper_tree(Config())
     assert {"skills.alpha", "skills.advantage_temperature", "values.expectile", "high_level.discount"} <= set(tree)

@@ -24,6 +24,7 @@ from qdos_brax.methods import METHODS
 from qdos_brax.methods import settings as recipe_settings
 from qdos_brax.methods.build import build_phases, evaluate_run
 from qdos_brax.networks import gaussian_log_prob
+from qdos_brax.population import Population
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
 from qdos_brax.skills.source import ActionSource, DirectionSource, TransitionSource
@@ -51,13 +52,17 @@ def config_of(method: str, **values: Any) -> configs.Config:
     return point_config(**{"method": method, "skills.horizon": horizon, "values.n_step": horizon} | values)
 
 
+def phases_of(config: configs.Config, dataset: Any) -> list[Any]:
+    return build_phases(config, PointEnv(), dataset, Population(configs.population_hyper(config)))
+
+
 def test_every_method_of_the_issue_is_there() -> None:
     assert set(METHODS) == set(PHASES)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_recipe_builds_its_phases(method: str) -> None:
-    phases = build_phases(config_of(method), PointEnv(), point_dataset(20))
+    phases = phases_of(config_of(method), point_dataset(20))
     assert [phase.name for phase in phases] == PHASES[method]
 
 
@@ -88,7 +93,7 @@ def test_published_values() -> None:
 
 def test_a_flat_method_refuses_skills() -> None:
     with pytest.raises(UserError, match=r"rlpd has no skills.*horizon must stay 1, not 5"):
-        build_phases(config_of("rlpd", **{"skills.horizon": 5}), PointEnv(), point_dataset(20))
+        phases_of(config_of("rlpd", **{"skills.horizon": 5}), point_dataset(20))
 
 
 # --- The flat learner, on a task whose optimum is known ------------------------------------------------------
@@ -117,7 +122,7 @@ def test_rlpd_reaches_the_optimum_of_the_plane() -> None:
         },
     )
     artifacts: dict[str, Any] = {}
-    for phase in build_phases(config, PointEnv(), point_dataset()):
+    for phase in phases_of(config, point_dataset()):
         state = phase.init(jax.random.split(jax.random.key(0), 1), artifacts)
         for _ in range(phase.num_chunks):
             state, metrics = phase.chunk(state)
@@ -146,7 +151,7 @@ def test_the_guides_steps_are_geometric() -> None:
 def test_the_guide_acts_first_and_only_so_long() -> None:
     """What is stored is the guide's action for the drawn number of steps, and the actor's after."""
     config = config_of("diffusion-jsrl", **{"high_level.warmup_env_steps": 0})
-    phase = build_phases(config, PointEnv(), point_dataset(20))[-1]
+    phase = phases_of(config, point_dataset(20))[-1]
     phase._guide.sample = lambda params, key, observation: jnp.full((observation.shape[0], 2), 0.123)
     state = phase.init(jax.random.split(jax.random.key(0), 1), {"guide": {"x": jnp.zeros(1)}})
     state = jax.tree.map(lambda x: x[0], state).replace(guided=jnp.array([3, 0]))
@@ -166,7 +171,7 @@ def test_the_guide_acts_first_and_only_so_long() -> None:
 def test_the_bonus_is_on_the_rows_it_is_asked_for(rows: str) -> None:
     config = config_of("explore", **{"labels.bonus_rows": rows, "labels.offline_reward": "data"})
     data = point_dataset(20)
-    phase = build_phases(config, PointEnv(), data)[-1]
+    phase = phases_of(config, data)[-1]
     labels = {"labels": jnp.zeros((1, data.size, 2)), "skills": {}}
     state = jax.tree.map(lambda x: x[0], phase.init(jax.random.split(jax.random.key(0), 1), labels))
     frozen = {"skills": {}, "labels": labels["labels"][0]}
@@ -218,7 +223,7 @@ def crash_at_the_second(chunk: Callable[[Any], Any]) -> Callable[[Any], Any]:
 def test_a_crashed_run_ends_as_if_nothing_had_happened(method: str, tmp_path: Path) -> None:
     config = config_of(method, **{"labels.start_env_steps": 40, "policy.every_updates": 20, "guide.updates": 20})
 
-    phases = build_phases(config, PointEnv(), point_dataset(20))  # once: what they carry over is what ``init`` sets
+    phases = phases_of(config, point_dataset(20))  # once: what they carry over is what ``init`` sets
     whole_chunk = phases[-1].chunk
 
     def run(path: Path, crash: bool) -> list[dict[str, str]]:

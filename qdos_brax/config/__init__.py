@@ -6,7 +6,8 @@ source of behaviour, and ``families:``), the command line's flags, ``--set key=v
 
 Two kinds of field are told apart by ``metadata["scan"]``. A scannable field is a number that a learner takes as an
 argument of its jitted program: it may hold a list, and every member of the scan gets its own value without a new
-compilation (``hyper_tree``, ``members``). Every other field shapes the program.
+compilation (``hyper_tree``, ``members``). Every other field shapes the program: several values of it make several
+programs, each a Config of its own (``load_programs``).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from qdos_brax.config.layers import (
     families,
     from_yaml,
     load_config,
+    load_programs,
     presets,
     replace,
     to_yaml,
@@ -34,6 +36,7 @@ from qdos_brax.config.schema import (
     LabelsConfig,
     PolicyConfig,
     RunConfig,
+    ScanConfig,
     SkillsConfig,
     ValuesConfig,
 )
@@ -49,6 +52,7 @@ __all__ = [
     "LabelsConfig",
     "PolicyConfig",
     "RunConfig",
+    "ScanConfig",
     "SkillsConfig",
     "ValuesConfig",
     "config_hash",
@@ -57,6 +61,7 @@ __all__ = [
     "from_yaml",
     "hyper_tree",
     "load_config",
+    "load_programs",
     "members",
     "nearest",
     "population_hyper",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any
 
 import yaml
 
-from qdos_brax.config.rules import convert, nearest
+from qdos_brax.config import scan
+from qdos_brax.config.rules import choices_in, convert, nearest
 from qdos_brax.config.schema import Config, leaves, plain
 from qdos_brax.errors import UserError
 from qdos_brax.methods import METHODS
@@ -38,6 +40,59 @@ def load_config(
     Raises:
         UserError: an unknown family, preset or key (the nearest is named), or a value out of its range.
     """
+    return _asked(_layers(env, preset, flags, sets))
+
+
+def load_programs(
+    env: str, preset: str | None = None, flags: Mapping[str, Any] | None = None, sets: Sequence[str] = ()
+) -> dict[str, Config]:
+    """As ``load_config``, but several values of what shapes the program make several configurations: their product.
+
+    Returns:
+        The configurations by what they do not share ("horizon-4_utd-5"); by "" if there is but one.
+    """
+    values = _layers(env, preset, flags, sets)
+    chosen: dict[str, list[Any]] = {}
+    for key, field in leaves(Config):
+        if key in values and _splits(key, field):
+            options = choices_in(key, values[key], field.metadata["rule"])
+            if len(options) > 1:
+                chosen[key] = options
+    if chosen and values.get("scan.combine") == "zip":
+        raise UserError(f"--zip pairs what one program can vary; {next(iter(chosen))} shapes the program, give one")
+    last = [key.rpartition(".")[2] for key in chosen]
+    short = {key: name if last.count(name) == 1 else key for key, name in zip(chosen, last, strict=True)}
+    programs: dict[str, Config] = {}
+    for combination in itertools.product(*chosen.values()):
+        own = dict(zip(chosen, combination, strict=True))
+        name = "_".join(f"{short[key]}-{_file_name(value)}" for key, value in own.items())
+        if name in programs:
+            raise UserError(f"the same program is asked for twice: {name.replace('_', ', ')}")
+        programs[name] = _asked(values | own)
+    return programs
+
+
+def _splits(key: str, field: Any) -> bool:
+    """Whether several values of the field make several programs."""
+    rule = field.metadata["rule"]
+    fixed = key.startswith(("run.", "scan.")) or key == "members_per_program"
+    free = rule.kind in ("path", "seeds") or (rule.kind == "text" and not rule.choices)
+    return not (field.metadata["scan"] or fixed or free)
+
+
+def _file_name(value: Any) -> str:
+    return "-".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _asked(values: Mapping[str, Any]) -> Config:
+    """The configuration of what was asked for, its scan drawn and checked."""
+    config = _build(scan.drawn(values))
+    scan.check(config)
+    return config
+
+
+def _layers(env: str, preset: str | None, flags: Mapping[str, Any] | None, sets: Sequence[str]) -> dict[str, Any]:
+    """All layers laid over one another, by dotted key."""
     family = env.split("-")[0]
     if family not in families():
         raise UserError(f"unknown task {env!r}{nearest(family, families())}; the families are {', '.join(families())}")
@@ -51,7 +106,7 @@ def load_config(
     values |= {"env": env, "preset": preset}
     values |= flags
     values |= dict(_parse_set(text) for text in sets)
-    return _build(values)
+    return values
 
 
 def default_preset() -> str:
@@ -87,10 +142,18 @@ def replace(config: Config, **values: Any) -> Config:
 
 
 def config_hash(config: Config) -> str:
-    """16 hex digits over everything that decides the result: not the folders, and not the ``run`` group."""
+    """16 hex digits over everything that decides the result: not the folders, and not the ``run`` group.
+
+    What says nothing is left out too, so that a run from before there was such a key can be read: how lists combine
+    where they do as ever, and how many members share a program where there is but one or that was never said.
+    """
     content = plain(config)
     for key in ("out", "dataset", "run"):
         del content[key]
+    if config.scan == Config().scan:
+        del content["scan"]
+    if config.members_per_program == 0 or len(scan.members(config)) == 1:
+        del content["members_per_program"]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 

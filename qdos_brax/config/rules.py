@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from qdos_brax.errors import UserError
 
 
@@ -81,14 +83,34 @@ def convert(key: str, value: Any, leaf: dataclasses.Field[Any]) -> Any:
     if rule.kind == "widths":
         return tuple(int(_number_in(key, item, rule, whole=True)) for item in _some(key, items))
     if rule.kind == "seeds":
-        return _distinct(key, tuple(int(_number_in(key, item, rule, whole=True)) for item in _some(key, items)))
+        return tuple(int(_number_in(key, item, rule, whole=True)) for item in _some(key, items))
     if isinstance(value, list | tuple) or len(items) > 1:
         if not leaf.metadata["scan"]:
             raise UserError(f"{key} takes one value, not a list: it shapes the program and cannot be scanned")
-        numbers = _distinct(key, tuple(_number_in(key, item, rule) for item in _some(key, items)))
+        numbers = tuple(_number_in(key, item, rule) for item in _some(key, items))
         return numbers if len(numbers) > 1 else numbers[0]
     single = _number_in(key, value, rule, whole=rule.kind == "int")
     return int(single) if rule.kind == "int" else single
+
+
+def values_in(key: str, value: Any, whole: bool = False) -> tuple[float, ...]:
+    """The numbers that ``value`` lists, or the one that it is, whatever the key's range."""
+    return tuple(_number_in(key, item, Rule("float"), whole) for item in _some(key, _items(value)))
+
+
+def choices_in(key: str, value: Any, rule: Rule) -> list[Any]:
+    """What ``value`` lists of a field that takes one value; widths are a list, so several are lists in a list."""
+    if rule.kind == "widths":
+        nested = isinstance(value, list) and any(isinstance(item, list) for item in value)
+        if isinstance(value, str) and ";" in value:
+            raise UserError(f"{key}: several lists of widths are written [[64,64],[128,128]], not {value!r}")
+        return _some(key, value) if nested else [value]
+    return _some(key, [_read(item) for item in _items(value)])
+
+
+def _read(item: Any) -> Any:
+    """A piece of a text as YAML reads it, so that "true" is no word."""
+    return yaml.safe_load(item) if isinstance(item, str) else item
 
 
 def _path(key: str, value: Any) -> str | None:
@@ -117,12 +139,6 @@ def _some(key: str, items: list[Any]) -> list[Any]:
     if not items:
         raise UserError(f"{key} must not be empty")
     return items
-
-
-def _distinct(key: str, values: tuple[Any, ...]) -> tuple[Any, ...]:
-    if len(set(values)) < len(values):
-        raise UserError(f"{key} holds the same value twice: {', '.join(map(str, values))}")
-    return values
 
 
 def _number_in(key: str, value: Any, rule: Rule, whole: bool = False) -> float:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+import math
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from qdos_brax.config.schema import Config, Scannable, get, leaves
+from qdos_brax.config.rules import values_in
+from qdos_brax.config.schema import Config, ScanConfig, get, leaves
 from qdos_brax.errors import UserError
+
+_DISTRIBUTION = re.compile(r"\s*(\w+)\s*\(([^(),]*),([^(),]*)\)\s*")
+_DRAWS_PER_SETTING = 100
 
 
 def hyper_tree(config: Config, member: Mapping[str, Any] | None = None) -> dict[str, float]:
@@ -34,23 +41,134 @@ def hyper_tree(config: Config, member: Mapping[str, Any] | None = None) -> dict[
 
 
 def members(config: Config) -> list[dict[str, Any]]:
-    """The product of the seeds and of every list-valued field: one dict per member of the population.
+    """The population: one dict per member, all different.
 
-    Each holds "seed", "alpha", and the dotted key of every other field that varies.
+    Each holds "seed", "alpha", and the dotted key of every other field that varies. How the lists combine says
+    ``config.scan``: by product, seeds first; as pairs, seeds included; or, where settings were drawn, every seed with
+    every setting.
     """
-    varied = {"seed": config.seed, "alpha": _as_tuple(config.skills.alpha)}
+    varied = _varied(config)
+    if config.scan.samples:
+        seeds = [("seed", seed) for seed in varied.pop("seed")]
+        rows = [(seed, *setting) for seed, setting in itertools.product(seeds, _pairs(varied))]
+    elif config.scan.combine == "zip":
+        rows = list(_pairs(varied))
+    else:
+        rows = list(itertools.product(*([(key, value) for value in values] for key, values in varied.items())))
+    return [dict(row) for row in dict.fromkeys(rows)]
+
+
+def population_hyper(config: Config, chosen: Sequence[Mapping[str, Any]] | None = None) -> dict[str, np.ndarray]:
+    """``hyper_tree`` of the ``chosen`` members (None for all), stacked: float32[members] by dotted key."""
+    trees = [hyper_tree(config, member) for member in (members(config) if chosen is None else chosen)]
+    return {key: np.asarray([tree[key] for tree in trees], np.float32) for key in trees[0]}
+
+
+def check(config: Config) -> None:
+    """Whether what was asked for makes sense as a scan.
+
+    Raises:
+        UserError: a member is asked for twice, or lists that shall be paired have unequal lengths.
+    """
+    several = {key: values for key, values in _varied(config).items() if len(values) > 1}
+    if config.scan.samples:
+        several = {key: values for key, values in several.items() if key == "seed"}
+    elif config.scan.combine == "zip":
+        if len({len(values) for values in several.values()}) > 1:
+            counts = ", ".join(f"{key} {len(values)}" for key, values in several.items())
+            raise UserError(f"--zip pairs lists of one length, and these have {counts} values")
+        rows = list(_pairs(several))
+        for row in rows:
+            if rows.count(row) > 1:
+                raise UserError(f"--zip makes the same member twice: {', '.join(f'{k} {v:g}' for k, v in row)}")
+        return
+    for key, values in several.items():
+        if len(set(values)) < len(values):
+            key = "skills.alpha" if key == "alpha" else key
+            raise UserError(f"{key} holds the same value twice: {', '.join(map(str, values))}")
+
+
+def drawn(values: Mapping[str, Any]) -> dict[str, Any]:
+    """``values`` (by dotted key, not converted yet) with drawn numbers where distributions and lists stand.
+
+    With ``scan.samples``, "uniform(a,b)" and "loguniform(a,b)" are drawn from, a list is one to draw from with equal
+    chances, and no setting comes twice.
+
+    Raises:
+        UserError: a distribution is wrong or not wanted, or there are fewer settings than asked for.
+    """
+    scannable = [key for key, field in leaves(Config) if field.metadata["scan"] and key in values]
+    written = {key: _distribution(key, values[key]) for key in scannable}
+    wanted = {key: found for key, found in written.items() if found is not None}
+    count = values_in("scan.samples", values.get("scan.samples", 0), whole=True)[0]
+    if not count:
+        for key in wanted:
+            raise UserError(f"{key}={values[key]} is drawn from with --sample N; give N")
+        return dict(values)
+    if values.get("scan.combine", ScanConfig.combine) != ScanConfig.combine:
+        raise UserError("--sample draws its own settings; leave out --zip")
+    seed = int(values_in("scan.draw_seed", values.get("scan.draw_seed", 0), whole=True)[0])
+    streams = {}
+    for key in scannable:
+        stream = np.random.default_rng([seed, zlib.crc32(key.encode())])
+        if key in wanted:
+            streams[key] = _draws(*wanted[key], stream)
+        elif len(listed := values_in(key, values[key])) > 1:
+            streams[key] = _choices(listed, stream)
+    if not streams:
+        raise UserError("--sample has nothing to draw; give a key as --set 'skills.alpha=loguniform(0.1,3)' or a list")
+    settings: dict[tuple[float, ...], None] = {}
+    for _ in range(_DRAWS_PER_SETTING * int(count)):
+        if len(settings) == count:
+            break
+        settings[tuple(next(stream) for stream in streams.values())] = None
+    if len(settings) < count:
+        raise UserError(f"--sample {int(count)} asks for more settings than there are ({len(settings)})")
+    columns = zip(*settings, strict=True)
+    return {**values, **{key: list(column) for key, column in zip(streams, columns, strict=True)}}
+
+
+def _varied(config: Config) -> dict[str, tuple[Any, ...]]:
+    """The seeds, alpha, and every other field that holds several values."""
+    alpha = config.skills.alpha
+    varied: dict[str, tuple[Any, ...]] = {"seed": config.seed, "alpha": alpha if isinstance(alpha, tuple) else (alpha,)}
     for key, field in leaves(Config):
         value = get(config, key)
         if field.metadata["scan"] and isinstance(value, tuple) and key != "skills.alpha":
             varied[key] = value
-    return [dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())]
+    return varied
 
 
-def population_hyper(config: Config) -> dict[str, np.ndarray]:
-    """``hyper_tree`` of every member, stacked: float32[members] by dotted key."""
-    trees = [hyper_tree(config, member) for member in members(config)]
-    return {key: np.asarray([tree[key] for tree in trees], np.float32) for key in trees[0]}
+def _pairs(varied: Mapping[str, tuple[Any, ...]]) -> Iterator[tuple[tuple[str, Any], ...]]:
+    """First with first, second with second, ..; a single value goes with each."""
+    count = max((len(values) for values in varied.values()), default=1)
+    for index in range(count):
+        yield tuple((key, values[index % len(values)]) for key, values in varied.items())
 
 
-def _as_tuple(value: Scannable) -> tuple[float, ...]:
-    return value if isinstance(value, tuple) else (value,)
+def _distribution(key: str, value: Any) -> tuple[str, float, float] | None:
+    """(name, low, high) of "name(low,high)"; None of what is no such text."""
+    match = _DISTRIBUTION.fullmatch(value) if isinstance(value, str) else None
+    if match is None:
+        return None
+    name, (low, high) = match[1], (values_in(key, text)[0] for text in match.groups()[1:])
+    if name not in ("uniform", "loguniform"):
+        raise UserError(f"{key}: there is no distribution {name!r}; there are uniform(a,b) and loguniform(a,b)")
+    if not low < high or (name == "loguniform" and low <= 0):
+        raise UserError(f"{key}={value} wants {'0 < ' if name == 'loguniform' else ''}a < b")
+    return name, low, high
+
+
+def _draws(name: str, low: float, high: float, stream: np.random.Generator) -> Iterator[float]:
+    """Numbers of the distribution, to six digits, as they can be read in a table."""
+    while True:
+        if name == "uniform":
+            number = stream.uniform(low, high)
+        else:
+            number = math.exp(stream.uniform(math.log(low), math.log(high)))
+        yield min(max(float(f"{number:.6g}"), low), high)
+
+
+def _choices(values: tuple[float, ...], stream: np.random.Generator) -> Iterator[float]:
+    while True:
+        yield values[stream.integers(len(values))]

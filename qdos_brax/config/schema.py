@@ -315,6 +315,21 @@ class EvalConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class ScanConfig:
+    """How the lists among the other values become members; the lists hold all values, drawn ones too.
+
+    Attributes:
+        combine: "product" (every value with every other) or "zip" (first with first, second with second, ..).
+        samples: settings drawn at random, each trained with every seed; 0 draws none.
+        draw_seed: seed of the draw; each key has its own stream, so that one more key leaves the others' values.
+    """
+
+    combine: str = choice("product", "product", "zip")
+    samples: int = count(0, low=0)
+    draw_seed: int = count(0, low=0)
+
+
+@dataclasses.dataclass(frozen=True)
 class RunConfig:
     """What changes where and how often a run writes, never what it computes.
 
@@ -341,6 +356,8 @@ class Config:
         preset: the sizes that were laid over the task's values: "paper", "cpu" or "smoke".
         seed: seeds; several make a scan.
         physics: engine: "auto" (MuJoCo C on a CPU, MJX on an accelerator), "mjx", "mjx-warp" (CUDA) or "mujoco".
+        members_per_program: members that one device trains at once; 0 lets the program choose before it starts, by
+            what is faster on a CPU and by what fits an accelerator. It decides the order of sums, hence last digits.
         dataset: a data file, or None to collect the task's default set.
         out: the run folder, or None to name one under ``run.root``.
         data: collection.
@@ -353,6 +370,7 @@ class Config:
         hilbert: Hilbert representation.
         diveoff: DiveOff.
         eval: evaluation.
+        scan: several values at once.
         run: writing.
     """
 
@@ -361,6 +379,7 @@ class Config:
     preset: str = field("paper", Rule("text"))
     seed: tuple[int, ...] = field((0,), Rule("seeds", low=0, high=2**32 - 1))
     physics: str = choice("auto", "auto", "mjx", "mjx-warp", "mujoco")
+    members_per_program: int = count(0, low=0)
     dataset: str | None = field(None, Rule("path"))
     out: str | None = field(None, Rule("path"))
     data: DataConfig = DataConfig()
@@ -373,6 +392,7 @@ class Config:
     hilbert: HilbertConfig = HilbertConfig()
     diveoff: DiveOffConfig = DiveOffConfig()
     eval: EvalConfig = EvalConfig()
+    scan: ScanConfig = ScanConfig()
     run: RunConfig = RunConfig()
 
 

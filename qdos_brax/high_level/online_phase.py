@@ -23,7 +23,8 @@ from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
 from qdos_brax.high_level.sac import SAC, Batch, Reference, SACHyper, SACState
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
-from qdos_brax.population import over_members
+from qdos_brax.memory import working_bytes
+from qdos_brax.population import Population
 from qdos_brax.skills.source import SkillSource
 
 NEVER = -1
@@ -90,7 +91,7 @@ class OnlinePhase:
         env: the task; the training environments and those of the evaluation are separate states of it.
         data: the data set on the device.
         normaliser: of observations.
-        hyper: scannable numbers by dotted key, float32[members] each.
+        population: the members.
         source: the frozen skills.
         labeller: gives offline rows their reward and mask.
         bonus: for novelty.
@@ -107,7 +108,7 @@ class OnlinePhase:
         env: Env,
         data: DeviceData,
         normaliser: Normaliser,
-        hyper: dict[str, jax.Array],
+        population: Population,
         source: SkillSource,
         labeller: OfflineReward,
         bonus: Bonus,
@@ -116,7 +117,7 @@ class OnlinePhase:
     ) -> None:
         high, self._horizon = config.high_level, config.skills.horizon
         self._config, self._env, self._data, self._normalise = config, env, data, normaliser
-        self._hyper, self._source, self._labeller = hyper, source, labeller
+        self._hyper, self._source, self._labeller = population.hyper, source, labeller
         self._novelty, self._guide = bonus, guide
         self._sac = high_level_sac(config, data.observations.shape[-1], source)
         self._offline = round(high.batch_size * high.offline_fraction)
@@ -130,15 +131,14 @@ class OnlinePhase:
         self._capacity = min(high.replay_capacity, self.num_chunks * self._iterations * high.num_envs)
         self._evaluate_every = max(1, round(config.eval.every_env_steps / (self._iterations * per_iteration)))
 
-        members = len(hyper["skills.alpha"])
-        self._start = jax.jit(jax.vmap(self._init))
-        self._chunk = jax.jit(over_members(self._train, members), donate_argnums=0)
-        self._evaluate = jax.jit(over_members(self._play_episodes, members))
+        self._start = population.program(self._init)
+        self._chunk = population.program(self._train, carries=True)
+        self._evaluate = population.program(self._play_episodes, carries=True)
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> OnlinePhaseState:
         """Fresh learners, empty replay, environments at their starts."""
         self._frozen = {name: artifacts.get(name, {}) for name in ("skills", "labels", "guide")}
-        state = self._start(key, self._hyper)
+        state: OnlinePhaseState = self._start(key, self._hyper, None)
         return state.replace(healthy=health.inherited(artifacts, len(key)))
 
     def chunk(self, state: OnlinePhaseState) -> tuple[OnlinePhaseState, dict[str, Any]]:
@@ -160,6 +160,10 @@ class OnlinePhase:
         }
         return state, metrics
 
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._frozen, self._hyper, self._data)
+
     def finish(self, state: OnlinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the actor and what it needs to see; labels and the guide are done with."""
         kept = {name: value for name, value in artifacts.items() if name not in ("labels", "guide")}
@@ -168,7 +172,7 @@ class OnlinePhase:
 
     # --- One member ------------------------------------------------------------------------------------------
 
-    def _init(self, key: jax.Array, hyper: dict[str, jax.Array]) -> OnlinePhaseState:
+    def _init(self, key: jax.Array, hyper: dict[str, jax.Array], _: None) -> OnlinePhaseState:
         sac_key, rnd_key, labeller_key, env_key, key = jax.random.split(key, 5)
         high = self._config.high_level
         observation = jnp.zeros(self._sac.observation_dim)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import numpy as np
 
 import envs
 from qdos_brax import config as configs
+from qdos_brax import memory
 from qdos_brax.config import Config
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, Normaliser, to_device
@@ -34,7 +35,7 @@ from qdos_brax.offline.iql_policy import IQLPolicy
 from qdos_brax.offline.learner import Learner, PolicyLearner
 from qdos_brax.offline.offline_phase import Evaluation, OfflinePhase
 from qdos_brax.offline.player import FlatPlayer
-from qdos_brax.population import over_members
+from qdos_brax.population import Population
 from qdos_brax.runs.checkpoint import final_artifacts
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import Phase
@@ -48,18 +49,23 @@ from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
 
 
-def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
+class RunPhase(Phase, memory.Sized, Protocol):
+    """A phase that the loop can run, and whose memory is known before."""
+
+
+def build_phases(config: Config, env: Any, dataset: Dataset, population: Population) -> list[RunPhase]:
     """The phases of ``config.method``, in order.
 
     Args:
         config: the run's configuration.
         env: the task's environment, as ``envs.make`` gives it.
         dataset: the data, labelled for that task.
+        population: the run's members.
 
     Raises:
         UserError: the data cannot serve this configuration.
     """
-    task = _task(config, env, dataset)
+    task = _task(config, env, dataset, population)
     high = config.high_level
     source = make_source(config, env)
     if task.recipe.policy is not None:
@@ -69,19 +75,32 @@ def build_phases(config: Config, env: Any, dataset: Dataset) -> list[Phase]:
     return [
         *_SOURCES[task.recipe.source].phases(task),
         *([] if guide is None else [_offline_phase(task, "guide", guide.learner, config.guide.updates)]),
-        *([LabelPhase(config, task.data, task.hyper, source)] if labelled else []),
+        *([LabelPhase(config, task.data, population, source)] if labelled else []),
         OnlinePhase(
             config,
             env,
             task.data,
             task.normaliser,
-            task.hyper,
+            population,
             source,
             _labeller(config, env, source),
             _bonus(config, env, source),
             None if guide is None else guide.jump_start,
         ),
     ]
+
+
+def plan_members(config: Config, env: Any, dataset: Dataset, members: Sequence[Mapping[str, Any]]) -> memory.Plan:
+    """How the members run on this process's devices, by an estimate of their memory.
+
+    Raises:
+        UserError: the data cannot serve this configuration.
+    """
+    one = Population(configs.population_hyper(config, members[:1]))
+    shared = sum(value.nbytes for value in vars(dataset).values() if isinstance(value, np.ndarray))
+    need = memory.estimate(build_phases(config, env, dataset, one), shared)
+    devices = jax.local_devices()
+    return memory.plan(need, len(members), devices, memory.room_of(devices[0]), config.members_per_program)
 
 
 def make_source(config: Config, env: Any) -> SkillSource:
@@ -98,32 +117,31 @@ class _Task(NamedTuple):
     dataset: Dataset
     data: DeviceData
     normaliser: Normaliser
-    hyper: dict[str, jax.Array]
+    population: Population
 
 
-def _task(config: Config, env: Any, dataset: Dataset) -> _Task:
+def _task(config: Config, env: Any, dataset: Dataset, population: Population) -> _Task:
     data, normaliser = to_device(dataset, config.skills.horizon)
     if data.starts.shape[0] == 0:
         raise UserError(
             f"no episode of {dataset.source} has {config.skills.horizon} steps, the length of a skill "
             "(--set skills.horizon=N shortens it)"
         )
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
-    return _Task(config, METHODS[config.method], env, dataset, data, normaliser, hyper)
+    return _Task(config, METHODS[config.method], env, dataset, population.shared(data), normaliser, population)
 
 
 class _Source(NamedTuple):
     """A kind of low-level behaviour: how it is made, and the phases that learn it."""
 
     make: Callable[[Config, Any], SkillSource]
-    phases: Callable[[_Task], list[Phase]]
+    phases: Callable[[_Task], list[RunPhase]]
 
 
 def _trajectory_source(config: Config, env: Any) -> SkillSource:
     return TrajectorySource(_skill_model(config, env), config.high_level.latent_map)
 
 
-def _trajectory_phases(task: _Task) -> list[Phase]:
+def _trajectory_phases(task: _Task) -> list[RunPhase]:
     config, recipe, env, data = task.config, task.recipe, task.env, task.data
     if recipe.weighted and config.values.n_step > config.skills.horizon:
         raise UserError(
@@ -132,8 +150,8 @@ def _trajectory_phases(task: _Task) -> list[Phase]:
     model = _skill_model(config, env)
     information = _information(config, recipe, env, model, task.normaliser, data)
     return [
-        *([value_phase(config, env, task.dataset, data, task.hyper)] if recipe.weighted else []),
-        SkillPhase(config, data, task.hyper, model, _weights(config, recipe, env), information),
+        *([value_phase(config, env, task.dataset, data, task.population)] if recipe.weighted else []),
+        SkillPhase(config, data, task.population, model, _weights(config, recipe, env), information),
     ]
 
 
@@ -154,7 +172,7 @@ def _direction_source(config: Config, env: Any) -> SkillSource:
     return DirectionSource(learner.latent_dim, learner.direction, learner.act)
 
 
-def _direction_phases(task: _Task) -> list[Phase]:
+def _direction_phases(task: _Task) -> list[RunPhase]:
     return [_offline_phase(task, "skills", _hilbert(task.config, task.env), task.config.hilbert.updates)]
 
 
@@ -175,7 +193,7 @@ def _transition_source(config: Config, env: Any) -> SkillSource:
     return TransitionSource(learner, learner.encode, config.high_level.latent_map)
 
 
-def _transition_phases(task: _Task) -> list[Phase]:
+def _transition_phases(task: _Task) -> list[RunPhase]:
     return [_offline_phase(task, "skills", _diveoff(task.config, task.env), task.config.diveoff.updates)]
 
 
@@ -199,7 +217,7 @@ _SOURCES = {
 def _offline_phase(
     task: _Task, name: str, learner: Learner, updates: int, evaluation: Evaluation | None = None
 ) -> OfflinePhase:
-    return OfflinePhase(name, learner, task.data, task.normaliser, task.hyper, updates, evaluation)
+    return OfflinePhase(name, learner, task.data, task.normaliser, task.population, updates, evaluation)
 
 
 class _Guide(NamedTuple):
@@ -244,12 +262,12 @@ def _policy_phase(task: _Task, name: str) -> OfflinePhase:
 
 
 def value_phase(
-    config: Config, env: Any, dataset: Dataset, data: DeviceData, hyper: dict[str, jax.Array]
+    config: Config, env: Any, dataset: Dataset, data: DeviceData, population: Population
 ) -> GraphPhase | ValuePhase:
     """The phase that finds the segments' advantages, by ``config.values.estimator``."""
     if config.values.estimator == "graph":
-        return GraphPhase(config.values, config.skills, data, dataset.ends, len(configs.members(config)))
-    return ValuePhase(config, data, hyper, IQL(env.observation_size, env.action_size, config.values.hidden))
+        return GraphPhase(config.values, config.skills, data, dataset.ends, population.members)
+    return ValuePhase(config, data, population, IQL(env.observation_size, env.action_size, config.values.hidden))
 
 
 class TrainedRun(NamedTuple):
@@ -335,7 +353,8 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
         agent = trained.agent(artifacts, hyper)
         return evaluate(trained.env, agent.choose, agent.play, key, episodes, trained.config.skills.horizon)
 
-    result = jax.jit(over_members(play, len(members)))(trained.artifacts, trained.hyper, evaluation_key())
+    program = Population(trained.hyper, trained.config.members_per_program).program(play)
+    result = program(trained.artifacts, trained.hyper, evaluation_key())
     means = {
         "success": np.asarray(result.success).mean(axis=-1),
         "return": np.asarray(result.episode_return).mean(axis=-1),

@@ -16,8 +16,9 @@ from qdos_brax import health
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.high_level.agent import Player
 from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
+from qdos_brax.memory import working_bytes
 from qdos_brax.offline.learner import Learner
-from qdos_brax.population import over_members
+from qdos_brax.population import Population
 
 
 class OfflinePhaseState(struct.PyTreeNode):
@@ -60,7 +61,7 @@ class OfflinePhase:
         learner: what learns.
         data: the data set on the device.
         normaliser: of observations.
-        hyper: scannable numbers by dotted key, float32[members] each.
+        population: the members.
         updates: gradient steps.
         evaluation: of a policy, or None.
         updates_per_chunk: gradient steps between two looks of the host.
@@ -74,31 +75,28 @@ class OfflinePhase:
         learner: Learner,
         data: DeviceData,
         normaliser: Normaliser,
-        hyper: dict[str, jax.Array],
+        population: Population,
         updates: int,
         evaluation: Evaluation | None = None,
         updates_per_chunk: int = 500,
     ) -> None:
         self.name = name
-        self._learner, self._data, self._normalise, self._hyper = learner, data, normaliser, hyper
+        self._learner, self._data, self._normalise = learner, data, normaliser
+        self._hyper = population.hyper
         every = updates if evaluation is None else evaluation.every_updates
         self._updates = min(updates_per_chunk, updates, every)
         self.num_chunks = -(-updates // self._updates)
         self._evaluate_every = max(1, round(every / self._updates))
-        members = len(hyper["skills.alpha"])
-        self._chunk = jax.jit(over_members(self._train, members), donate_argnums=0)
+        self._start = population.program(self._init)
+        self._chunk = population.program(self._train, carries=True)
         self._evaluate = None
         if evaluation is not None:
-            self._evaluate = jax.jit(over_members(lambda params, key, _: evaluation(params, key), members))
+            self._evaluate = population.program(lambda params, key, _: evaluation(params, key))
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> OfflinePhaseState:
         """A fresh learner for every member."""
-
-        def one(key: jax.Array) -> OfflinePhaseState:
-            learner_key, key = jax.random.split(key)
-            return OfflinePhaseState(key, self._learner.init(learner_key), jnp.zeros((), jnp.int32), jnp.ones((), bool))
-
-        return jax.jit(jax.vmap(one))(key).replace(healthy=health.inherited(artifacts, len(key)))
+        state: OfflinePhaseState = self._start(key, None)
+        return state.replace(healthy=health.inherited(artifacts, len(key)))
 
     def chunk(self, state: OfflinePhaseState) -> tuple[OfflinePhaseState, dict[str, Any]]:
         """``updates_per_chunk`` gradient steps, and an evaluation when one is due (always after the last chunk)."""
@@ -114,11 +112,19 @@ class OfflinePhase:
             metrics |= summary(episodes) | {"eval_seconds": time.perf_counter() - started}
         return state, metrics
 
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._hyper, self._data)
+
     def finish(self, state: OfflinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the learner's parameters under the phase's name, and what observations they were learned on."""
         normaliser = self._normalise.repeated(state.update.shape[0])
         learned = {self.name: self._learner.params(state.learner), "normaliser": normaliser}
         return artifacts | learned | {health.KEY: state.healthy}
+
+    def _init(self, key: jax.Array, _: None) -> OfflinePhaseState:
+        learner_key, key = jax.random.split(key)
+        return OfflinePhaseState(key, self._learner.init(learner_key), jnp.zeros((), jnp.int32), jnp.ones((), bool))
 
     def _train(self, state: OfflinePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> Any:
         def update(learner: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:

@@ -26,6 +26,11 @@ _NOT_A_SETTING = {
     "out",
     "dataset",
     *(key for key, _ in leaves(Config) if key.startswith("run.")),
+    # How members were found and run; what differs for it is among the values.
+    "scan.combine",
+    "scan.samples",
+    "scan.draw_seed",
+    "members_per_program",
 }
 # Where methods that are compared on one task have to agree.
 _BUDGET = ("preset", "physics", "high_level.env_steps", "eval.episodes", DATA)

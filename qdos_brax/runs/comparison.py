@@ -1,4 +1,4 @@
-"""A comparison: a folder that holds one run folder per method, and the order in which they are run."""
+"""A comparison: a folder of run folders, one per method or choice of sizes, and the order in which they are run."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def is_comparison(path: str | Path) -> bool:
 
 
 def create(path: Path, configs: Mapping[str, str]) -> None:
-    """Makes the folder with a run folder per method, none of them begun; all at once or not at all.
+    """Makes the folder with its run folders, none of them begun; all at once or not at all.
 
     Args:
         path: the comparison's folder, absent or empty.
-        configs: config.yaml by method, in the order of the runs.
+        configs: config.yaml by name, in the order of the runs.
 
     Raises:
         UserError: there is something at ``path``, or it cannot be written.
@@ -36,21 +36,22 @@ def create(path: Path, configs: Mapping[str, str]) -> None:
         if path.exists() and any(path.iterdir()):
             raise UserError(f"{path} is not empty; choose another --out")
         shutil.rmtree(partial, ignore_errors=True)
-        for method, text in configs.items():
-            (partial / method).mkdir(parents=True)
-            write_text(RunFolder(partial / method).config, text)
-        write_text(partial / _FILE, json.dumps({"methods": list(configs)}) + "\n")
+        for name, text in configs.items():
+            (partial / name).mkdir(parents=True)
+            write_text(RunFolder(partial / name).config, text)
+        write_text(partial / _FILE, json.dumps({"runs": list(configs)}) + "\n")
         os.replace(partial, path)
 
 
 def runs(path: Path) -> dict[str, RunFolder]:
-    """The run folders by method, in order.
+    """The run folders by name, in order.
 
     Raises:
         UserError: there is no comparison at ``path``, or it is damaged.
     """
     try:
-        methods = json.loads((path / _FILE).read_text(encoding="utf-8"))["methods"]
-        return {str(method): RunFolder.open(path / method) for method in methods}
+        content = json.loads((path / _FILE).read_text(encoding="utf-8"))
+        names = content["methods" if "methods" in content else "runs"]  # "methods" until sizes were compared too
+        return {str(name): RunFolder.open(path / name) for name in names}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"cannot read {path / _FILE} ({error}); report or resume its run folders one by one") from error

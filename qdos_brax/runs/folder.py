@@ -93,6 +93,14 @@ class RunFolder:
         finally:
             os.close(descriptor)
 
+    def is_held(self) -> bool:
+        """Whether a process holds the folder."""
+        try:
+            with self.held():
+                return False
+        except UserError:
+            return True
+
     def read_summary(self) -> dict[str, Any] | None:
         """summary.json, or None where the run has not ended."""
         if not self.summary.is_file():

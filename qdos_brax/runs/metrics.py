@@ -110,7 +110,7 @@ class MetricsTable:
             self._rewrite()
         else:
             with user_errors(self._path), self._path.open("a", encoding="utf-8", newline="") as file:
-                file.write(self._text(rows))
+                file.write(_text(self.columns, rows))
         for observer in self._observers:
             observer.append(rows)
 
@@ -145,12 +145,12 @@ class MetricsTable:
         self.rows += rows
 
     def _rewrite(self) -> None:
-        write_text(self._path, ",".join(self.columns) + "\n" + self._text(self.rows))
+        write_rows(self._path, self.columns, self.rows)
 
-    def _text(self, rows: Sequence[Row]) -> str:
-        text = io.StringIO()
-        csv.DictWriter(text, self.columns, restval="", lineterminator="\n").writerows(rows)
-        return text.getvalue()
+
+def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
+    """Writes a whole table at once."""
+    write_text(path, ",".join(columns) + "\n" + _text(columns, rows))
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -185,6 +185,12 @@ def measured(row: Row, members: Sequence[Mapping[str, Any]]) -> dict[str, float]
 def step_of(row: Row) -> int:
     """Where on its phase's axis a row stands: environment steps once there are any, else updates."""
     return int(float(row.get("env_steps") or 0)) or int(float(row.get("update") or 0))
+
+
+def _text(columns: Sequence[str], rows: Sequence[Row]) -> str:
+    text = io.StringIO()
+    csv.DictWriter(text, columns, restval="", lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def _cell(value: Any) -> str:

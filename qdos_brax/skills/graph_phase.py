@@ -48,6 +48,10 @@ class GraphPhase:
         found = {"update": np.ones(self._members), "cost_to_go": np.full(self._members, costs.mean())}
         return jnp.tile(-jnp.asarray(costs), (self._members, 1)), found
 
+    def working_bytes(self, state: Any) -> int:
+        """The search is the host's: nothing."""
+        return 0
+
     def finish(self, state: jax.Array, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the scaled advantage of every segment, float32[members, S].
 

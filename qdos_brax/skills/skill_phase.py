@@ -16,7 +16,8 @@ from qdos_brax.config import Config, SkillsConfig
 from qdos_brax.data.device import DeviceData, macro_rows
 from qdos_brax.data.segments import window
 from qdos_brax.high_level.sac import ADAM, adam_step
-from qdos_brax.population import over_members
+from qdos_brax.memory import working_bytes
+from qdos_brax.population import Population
 from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
@@ -69,7 +70,7 @@ class SkillPhase:
     Args:
         config: the run's configuration.
         data: the data set on the device.
-        hyper: scannable numbers by dotted key, float32[members] each.
+        population: the members.
         model: posterior, prior and decoder.
         weights: where segment advantages come from.
         information: where the states of the mutual-information term come from, or None to leave the term out.
@@ -83,38 +84,26 @@ class SkillPhase:
         self,
         config: Config,
         data: DeviceData,
-        hyper: dict[str, Any],
+        population: Population,
         model: SkillModel,
         weights: SegmentWeights,
         information: Information | None,
         blocks_per_chunk: int = 10,
     ) -> None:
         self._skills: SkillsConfig = config.skills
-        self._data, self._hyper = data, hyper
+        self._data, self._hyper = data, population.hyper
         self._model, self._weights, self._information = model, weights, information
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
         self._blocks = min(blocks_per_chunk, total_blocks)
         self.num_chunks = -(-total_blocks // self._blocks)
-        self._chunk = jax.jit(over_members(self._train, len(hyper["skills.alpha"])), donate_argnums=0)
+        self._start = population.program(self._init)
+        self._chunk = population.program(self._train, carries=True)
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> SkillPhaseState:
         """Fresh networks for every member."""
-
-        def one(key: jax.Array) -> SkillPhaseState:
-            model_key, weights_key, key = jax.random.split(key, 3)
-            params = self._model.init(model_key)
-            return SkillPhaseState(
-                key=key,
-                params=params,
-                moments=ADAM.init(params),
-                weights=self._weights.init(weights_key),
-                update=jnp.zeros((), jnp.int32),
-                broken=jnp.zeros((), jnp.int32),
-                healthy=jnp.ones((), bool),
-            )
-
         self._artifacts = {name: artifacts[name] for name in ("advantage",) if name in artifacts}
-        return jax.vmap(one)(key).replace(healthy=health.inherited(artifacts, len(key)))
+        state: SkillPhaseState = self._start(key, None)
+        return state.replace(healthy=health.inherited(artifacts, len(key)))
 
     def chunk(self, state: SkillPhaseState) -> tuple[SkillPhaseState, dict[str, np.ndarray]]:
         """``blocks_per_chunk`` x ``mi_every`` gradient steps."""
@@ -124,9 +113,26 @@ class SkillPhase:
             metrics["broken_envs"] = np.asarray(state.broken)
         return state, metrics | {"status_ok": np.asarray(state.healthy)}
 
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._hyper, self._artifacts, self._data)
+
     def finish(self, state: SkillPhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the skill model's parameters; the weights' own are done with."""
         return artifacts | {"skills": state.params, health.KEY: state.healthy}
+
+    def _init(self, key: jax.Array, _: None) -> SkillPhaseState:
+        model_key, weights_key, key = jax.random.split(key, 3)
+        params = self._model.init(model_key)
+        return SkillPhaseState(
+            key=key,
+            params=params,
+            moments=ADAM.init(params),
+            weights=self._weights.init(weights_key),
+            update=jnp.zeros((), jnp.int32),
+            broken=jnp.zeros((), jnp.int32),
+            healthy=jnp.ones((), bool),
+        )
 
     def _train(self, state: SkillPhaseState, hyper: Any, artifacts: Any, data: DeviceData) -> Any:
         keys = jax.random.split(state.key, self._blocks + 1)

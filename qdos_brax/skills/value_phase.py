@@ -15,7 +15,8 @@ from qdos_brax import health
 from qdos_brax.config import Config, SkillsConfig, ValuesConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import macro_return, window
-from qdos_brax.population import over_members
+from qdos_brax.memory import working_bytes
+from qdos_brax.population import Population
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState
 from qdos_brax.skills.weights import scaled_advantage, segment_advantage, transition_advantage
 
@@ -37,7 +38,7 @@ class ValuePhase:
     Args:
         config: the run's configuration.
         data: the data set on the device.
-        hyper: scannable numbers by dotted key, float32[members] each.
+        population: the members.
         iql: the learner.
         updates_per_chunk: gradient steps between two looks of the host.
     """
@@ -46,25 +47,21 @@ class ValuePhase:
     part = "pretrain"
 
     def __init__(
-        self, config: Config, data: DeviceData, hyper: dict[str, Any], iql: IQL, updates_per_chunk: int = 500
+        self, config: Config, data: DeviceData, population: Population, iql: IQL, updates_per_chunk: int = 500
     ) -> None:
         self._values: ValuesConfig = config.values
         self._skills: SkillsConfig = config.skills
-        self._data, self._hyper, self._iql = data, hyper, iql
+        self._data, self._hyper, self._iql = data, population.hyper, iql
         self._updates = min(updates_per_chunk, config.values.updates)
         self.num_chunks = -(-config.values.updates // self._updates)
-        members = len(hyper["values.discount"])
-        self._chunk = jax.jit(over_members(self._train, members), donate_argnums=0)
-        self._advantages = jax.jit(over_members(self._all_advantages, members))
+        self._start = population.program(self._init)
+        self._chunk = population.program(self._train, carries=True)
+        self._advantages = population.program(self._all_advantages)
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> ValuePhaseState:
         """Fresh networks for every member."""
-
-        def one(key: jax.Array) -> ValuePhaseState:
-            init_key, key = jax.random.split(key)
-            return ValuePhaseState(key, self._iql.init(init_key), jnp.zeros((), jnp.int32), jnp.ones((), bool))
-
-        return jax.vmap(one)(key).replace(healthy=health.inherited(artifacts, len(key)))
+        state: ValuePhaseState = self._start(key, None)
+        return state.replace(healthy=health.inherited(artifacts, len(key)))
 
     def chunk(self, state: ValuePhaseState) -> tuple[ValuePhaseState, dict[str, np.ndarray]]:
         """``updates_per_chunk`` gradient steps."""
@@ -72,10 +69,18 @@ class ValuePhase:
         metrics = {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
         return state, metrics | {"status_ok": np.asarray(state.healthy)}
 
+    def working_bytes(self, state: Any) -> int:
+        """What a chunk needs beside the state, which may be shapes alone."""
+        return working_bytes(self._chunk, state, self._hyper, self._data)
+
     def finish(self, state: ValuePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Adds the scaled advantage of every segment, float32[members, S]."""
         advantage = self._advantages(state, self._hyper, self._data)
         return artifacts | {"advantage": advantage, health.KEY: state.healthy}
+
+    def _init(self, key: jax.Array, _: None) -> ValuePhaseState:
+        init_key, key = jax.random.split(key)
+        return ValuePhaseState(key, self._iql.init(init_key), jnp.zeros((), jnp.int32), jnp.ones((), bool))
 
     def _train(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> Any:
         value_hyper = ValueHyper(hyper["values.learning_rate"], hyper["values.expectile"], hyper["values.target_rate"])

@@ -13,6 +13,7 @@ from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
+from qdos_brax.population import Population
 from qdos_brax.skills.segment_weights import UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.source import TrajectorySource
@@ -27,22 +28,24 @@ def plane():
     """(data, normaliser, source, artifacts of one member with trained skills and labels)."""
     config = point_config(**SKILLS)
     data, normaliser = to_device(point_dataset(), config.skills.horizon)
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    population = Population(configs.population_hyper(config))
     model = SkillModel(2, 2, config.skills.latent_dim, 16, 1, (32, 32), (32, 32))
     seeds = np.zeros(1, np.uint32)
-    artifacts = run(SkillPhase(config, data, hyper, model, UniformWeights(), None), phase_keys(seeds, 0), {})
+    artifacts = run(SkillPhase(config, data, population, model, UniformWeights(), None), phase_keys(seeds, 0), {})
     source = TrajectorySource(model, config.high_level.latent_map)
-    artifacts = run(LabelPhase(config, data, hyper, source), phase_keys(seeds, 1), artifacts)
+    artifacts = run(LabelPhase(config, data, population, source), phase_keys(seeds, 1), artifacts)
     return data, normaliser, source, artifacts
 
 
 def online_phase(plane, config):
     """(phase, artifacts, keys) for the members of ``config``, on the shared skills."""
     data, normaliser, source, artifacts = plane
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    population = Population(configs.population_hyper(config))
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
     bonus = RNDBonus(RND(2 + source.width, config.labels.rnd_hidden, config.labels.rnd_features))
-    phase = OnlinePhase(config, PointEnv(), data, normaliser, hyper, source, DataReward(), bonus, steps_per_chunk=100)
+    phase = OnlinePhase(
+        config, PointEnv(), data, normaliser, population, source, DataReward(), bonus, steps_per_chunk=100
+    )
     repeated = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), artifacts)
     return phase, repeated, phase_keys(seeds, 2)
 
@@ -157,8 +160,8 @@ def test_labels_are_samples_of_the_posterior():
     encoder["params"]["Dense_0"]["bias"] = jnp.array([1.0, -2.0, -5.0, -5.0])  # mean (1, -2), deviation exp(-5)
     artifacts = {"skills": jax.tree.map(lambda x: x[None], params | {"encoder": encoder})}
     config = configs.replace(config, **{"skills.latent_box": 10.0})
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
-    phase = LabelPhase(config, data, hyper, TrajectorySource(model, "box"), chunk_size=1000)
+    population = Population(configs.population_hyper(config))
+    phase = LabelPhase(config, data, population, TrajectorySource(model, "box"), chunk_size=1000)
     assert phase.num_chunks > 1
     labels = run(phase, phase_keys(np.zeros(1, np.uint32), 0), artifacts)["labels"]
     assert labels.shape == (1, data.starts.shape[0], 2)

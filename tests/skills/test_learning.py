@@ -10,6 +10,7 @@ import pytest
 from qdos_brax import config as configs
 from qdos_brax.data.device import to_device
 from qdos_brax.networks import gaussian_sample
+from qdos_brax.population import Population
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
@@ -62,15 +63,15 @@ def make_model(config, env):
 def train_skills(config, weights=None, information=True, artifacts=None, chunks=None, spread=np.pi):
     env, dataset = PointEnv(), point_dataset(spread=spread)
     data, normaliser = to_device(dataset, config.skills.horizon)
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    population = Population(configs.population_hyper(config))
     model = make_model(config, env)
     source = None
     if information:
         source = PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
         if config.skills.mi_rollout == "logged":
             source = LoggedStates(config.skills.horizon)
-    phase = SkillPhase(config, data, hyper, model, weights or UniformWeights(), source)
-    members = len(hyper["skills.alpha"])
+    phase = SkillPhase(config, data, population, model, weights or UniformWeights(), source)
+    members = population.members
     state = phase.init(jax.random.split(jax.random.key(0), members), artifacts or {})
     metrics = {}
     for _ in range(chunks or phase.num_chunks):
@@ -124,8 +125,8 @@ def test_skills_reconstruct_what_the_data_does():
 def value_phase(config):
     dataset = point_dataset()
     data, _ = to_device(dataset, config.skills.horizon)
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
-    phase = ValuePhase(config, data, hyper, IQL(2, 2, (64, 64)), updates_per_chunk=500)
+    population = Population(configs.population_hyper(config))
+    phase = ValuePhase(config, data, population, IQL(2, 2, (64, 64)), updates_per_chunk=500)
     state = phase.init(jax.random.split(jax.random.key(0), 1), {})
     for _ in range(phase.num_chunks):
         state, _ = phase.chunk(state)
@@ -178,12 +179,12 @@ def test_latent_weights_learn_along(values):
 
 def test_chunks_are_not_traced_again_and_members_differ_by_seed_and_value():
     config = configs.replace(point_config(), **{"seed": (0, 1), "skills.alpha": (0.1, 0.3)})
-    hyper = {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()}
+    population = Population(configs.population_hyper(config))
     env = PointEnv()
     data, normaliser = to_device(point_dataset(), config.skills.horizon)
     model = make_model(config, env)
     source = PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
-    phase = SkillPhase(config, data, hyper, model, UniformWeights(), source, blocks_per_chunk=2)
+    phase = SkillPhase(config, data, population, model, UniformWeights(), source, blocks_per_chunk=2)
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
     state = phase.init(jax.vmap(jax.random.key)(seeds), {})
     leaf = partial(lambda s: np.asarray(jax.tree.leaves(s.params["decoder"])[1]))
