@@ -130,10 +130,12 @@ def _filter(window: Browser) -> None:
 
 def _switch_colours(window: Browser) -> None:
     """One button changes the colour of every method's latents."""
-    titles = "const chart = document.querySelector('section:has(button) .chart'); return chart.data[0].marker.color[0]"
-    before = window.run(titles)
+    colour = "return document.querySelector('section:has([data-choice]) .chart').data[0].marker.color[0]"
+    before = window.run(colour)
     assert before in (0, 1, 2, 3)
     window.click("button[data-choice=return]")
-    assert window.run(titles) != before
-    pressed = window.run("return [...document.querySelectorAll('button[aria-pressed=true]')].map(b => b.textContent)")
+    assert window.run(colour) != before
+    pressed = window.run(
+        "return [...document.querySelectorAll('[data-choice][aria-pressed=true]')].map(b => b.textContent)"
+    )
     assert pressed == ["return"]
