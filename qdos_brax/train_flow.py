@@ -108,12 +108,12 @@ def _compare(path: Path, started: float, chosen: bool) -> None:
 def _go_on(folder: RunFolder, started: float, chosen: bool) -> None:
     """Runs what has not been done yet of a run."""
     with folder.held(), signals.stops_at_once(folder.path):
+        config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
         summary = folder.read_summary()
         if summary is not None:
             print(f"{folder.path} has ended already")
             _conclude(folder, summary)
             return
-        config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
         observers.check(config.run)
         env = _make_env(config)
         _announce(config, config, chosen)
