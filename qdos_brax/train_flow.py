@@ -137,12 +137,12 @@ def _go_on(folder: RunFolder, started: float, chosen: bool, hosts: Hosts = ALONE
         _run(configs.from_yaml(folder.config), folder, started, hosts)
         return
     with folder.held(), signals.stops_at_once(folder.path):
+        config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
         summary = folder.read_summary()
         if summary is not None:
             print(f"{folder.path} has ended already")
             _conclude(folder, summary)
             return
-        config = configs.replace(configs.from_yaml(folder.config), out=str(folder.path))
         observers.check(config.run)
         _announce(config, config, chosen)
         _run(config, folder, started, hosts)

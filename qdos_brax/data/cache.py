@@ -70,6 +70,7 @@ def make_file(
 ) -> None:
     """Collects a set (see ``collect.collect``) with a progress bar; writes it to ``path`` with where it came from."""
     policy = policy or collect.shipped_expert(env)
+    collect.check_size(transitions, seed, num_envs)  # before there is a bar
     with tqdm(total=transitions, unit="steps", unit_scale=True, desc="collect", file=sys.stderr) as bar:
 
         def report(done: int, total: int) -> None:

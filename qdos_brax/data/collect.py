@@ -110,10 +110,7 @@ def collect(
     Raises:
         UserError: an argument out of range, or a body that no expert is shipped for.
     """
-    if transitions < SHORTEST_EPISODE:
-        raise UserError(f"transitions must be at least {SHORTEST_EPISODE} (one episode), got {transitions}")
-    if num_envs < 1 or seed < 0:
-        raise UserError(f"seed must be 0 or more, num_envs 1 or more; got {seed}, {num_envs}")
+    check_size(transitions, seed, num_envs)
     expert = policy or shipped_expert(env)
     length = recipe.episode_steps or _episode_length(transitions, num_envs, env.episode_length)
     episodes = -(-transitions // length)
@@ -133,6 +130,14 @@ def collect(
     rows["rewards"] = success.astype(np.float32) - 1.0
     rows["terminals"] = np.zeros(transitions, bool)
     return rows
+
+
+def check_size(transitions: int, seed: int, num_envs: int) -> None:
+    """Raises UserError if ``collect`` cannot take one of these."""
+    if transitions < SHORTEST_EPISODE:
+        raise UserError(f"transitions must be at least {SHORTEST_EPISODE} (one episode), got {transitions}")
+    if num_envs < 1 or seed < 0:
+        raise UserError(f"seed must be 0 or more, num_envs 1 or more; got {seed}, {num_envs}")
 
 
 def goals_per_1000(env: TaskEnv, policy: policies.Policy, noise: float, seed: int, episodes: int = 64) -> float:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from qdos_brax.errors import UserError
+from qdos_brax.runs import signals
 from qdos_brax.runs.folder import RunFolder, new_path, write_text
 
 
@@ -63,3 +65,25 @@ def test_new_path_never_repeats(tmp_path: Path) -> None:
     first = new_path(tmp_path, "a")
     first.mkdir()
     assert new_path(tmp_path, "a") != first
+
+
+def test_what_a_kill_left_half_written_is_not_in_the_way(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    (folder.path / ".config.partial.yaml").write_text("env: antm")
+    RunFolder.create(folder.path)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_outside_the_phases_says_how_to_go_on(
+    number: int, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as stopped, signals.stops_at_once(tmp_path):
+        try:
+            os.kill(os.getpid(), number)
+            signal.pause()
+        except SystemExit as error:  # as a compiled program does with what its callback raises
+            raise RuntimeError("INTERNAL: callback") from error
+    assert stopped.value.code == code and signal.getsignal(number) is before
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"stopped; go on with: python train.py --resume {tmp_path}"
