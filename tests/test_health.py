@@ -23,6 +23,7 @@ from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward
 from qdos_brax.offline.bc import BC
 from qdos_brax.offline.offline_phase import OfflinePhase
+from qdos_brax.population import Population
 from qdos_brax.report.write import write_report
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
@@ -47,17 +48,17 @@ def phases() -> dict[str, Any]:
     """Every kind of phase that learns, for three members; ``_hyper`` is to be set."""
     config = configs.replace(point_config(**SMALL), seed=SEEDS)
     data, normaliser = to_device(point_dataset(episodes=40), config.skills.horizon)
-    hyper = hyper_of(config)
+    population = Population(hyper_of(config))
     model = SkillModel(2, 2, 2, 8, 1, (16,), (16,))
     information = PhysicsRollout(PointEnv(), model, normaliser, config.skills.horizon, data)
     source = TrajectorySource(model, "box")
     return {
-        "values": ValuePhase(config, data, hyper, IQL(2, 2, (16,)), updates_per_chunk=10),
-        "skills": SkillPhase(config, data, hyper, model, LoggedWeights(), information, blocks_per_chunk=1),
-        "policy": OfflinePhase("policy", BC(2, 2, (16,), 16), data, normaliser, hyper, 20, None, 10),
-        "label": LabelPhase(config, data, hyper, source),
+        "values": ValuePhase(config, data, population, IQL(2, 2, (16,)), updates_per_chunk=10),
+        "skills": SkillPhase(config, data, population, model, LoggedWeights(), information, blocks_per_chunk=1),
+        "policy": OfflinePhase("policy", BC(2, 2, (16,), 16), data, normaliser, population, 20, None, 10),
+        "label": LabelPhase(config, data, population, source),
         "online": OnlinePhase(
-            config, PointEnv(), data, normaliser, hyper, source, DataReward(), NoBonus(), steps_per_chunk=100
+            config, PointEnv(), data, normaliser, population, source, DataReward(), NoBonus(), steps_per_chunk=100
         ),
     }
 
@@ -135,7 +136,9 @@ def breaking() -> tuple[SkillPhase, dict[str, jax.Array]]:
     data, normaliser = to_device(point_dataset(episodes=40), config.skills.horizon)
     model = SkillModel(2, 2, 2, 8, 1, (16,), (16,))
     information = PhysicsRollout(BreakingEnv(), model, normaliser, config.skills.horizon, data)
-    phase = SkillPhase(config, data, hyper_of(config), model, LoggedWeights(), information, blocks_per_chunk=1)
+    phase = SkillPhase(
+        config, data, Population(hyper_of(config)), model, LoggedWeights(), information, blocks_per_chunk=1
+    )
     return phase, {"advantage": jnp.zeros((3, data.starts.shape[0]))}
 
 
