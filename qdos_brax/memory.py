@@ -14,6 +14,8 @@ from typing import Any, Protocol
 
 import jax
 
+from qdos_brax import health
+
 _ROOM = 0.9  # share of a device's memory that is planned with; the rest is for fragments and for what XLA adds
 _GB = 1e9
 
@@ -79,6 +81,7 @@ def estimate(phases: Sequence[Sized], shared: int) -> Estimate:
         kept = max(kept, num_bytes(state) + num_bytes(artifacts))
         working = max(working, phase.working_bytes(state))
         artifacts = jax.eval_shape(phase.finish, state, artifacts)
+        artifacts.pop(health.KEY, None)  # a copy is made of it, and shapes cannot be copied
     return Estimate(shared, kept, working)
 
 
