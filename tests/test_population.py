@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -15,6 +18,7 @@ from qdos_brax import memory
 from qdos_brax.population import Population
 from qdos_brax.runs import parts
 from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.metrics import read_rows
 
 ROOT = Path(__file__).parents[1]
 SHARED = np.linspace(-1, 1, 64, dtype=np.float32).reshape(8, 8)
@@ -147,3 +151,38 @@ def test_a_process_that_stopped_is_said(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(parts, "_PATIENCE", 0.0)
     with pytest.raises(parts.UserError, match="has stopped before its end"):
         parts.await_end(parts.parts_of(folder)[1])
+
+
+@pytest.mark.slow
+def test_two_processes_train_the_members_of_one_and_go_on_after_a_kill(tmp_path: Path) -> None:
+    dataset, sizes = (
+        tmp_path / "data.hdf5",
+        "--set policy.updates=40 --set policy.every_updates=20 --set eval.episodes=1",
+    )
+    make = f"-m qdos_brax data make antmaze-medium --out {dataset} --transitions 4000"
+    subprocess.run([sys.executable, *make.split()], check=True, cwd=ROOT)
+    flags = f"--env antmaze-medium --preset smoke --method bc --seed 0,1,2 {sizes} --members-per-program 1"
+    flags += f" --dataset {dataset} --set run.checkpoint_seconds=0"
+    assert launch(f"{flags} --out {tmp_path}/one").wait(280) == 0
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    meet = f"--distributed --coordinator localhost:{port} --processes 2 --process-id"
+    second, first = (launch(f"{flags} --out {tmp_path}/two {meet} {index}") for index in (1, 0))
+    part = tmp_path / "two" / "processes" / "0" / "metrics.csv"
+    while not part.exists() or len(part.read_text().splitlines()) < 3:
+        assert first.poll() is None
+        time.sleep(0.02)
+    first.kill()
+    first.wait()
+    assert second.wait(280) == 0  # it does not need the first one
+    assert not (tmp_path / "two" / "summary.json").exists()
+    assert launch(f"--resume {tmp_path}/two").wait(280) == 0
+    one, two = (read_rows(tmp_path / name / "metrics.csv") for name in ("one", "two"))
+    assert [row | {"sps": ""} for row in one] == [row | {"sps": ""} for row in two]
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("one", "two")]
+    assert summaries[0]["members"] == summaries[1]["members"]
+
+
+def launch(flags: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, str(ROOT / "train.py"), *flags.split()], cwd=ROOT)
