@@ -1,8 +1,9 @@
 """How many members a device trains at once: an estimate of their memory before anything runs, and a choice.
 
-As many go together as fit, on a CPU too. Measured there (two cores, antmaze-medium, 3 and 9 members, presets cpu and
-smoke, MuJoCo C): the online phase of members in one program takes about half the time of members in turn, since its
-batches of simulations are larger and its many small steps are made once for all; for the other phases it is the same.
+As many go together as fit, on a CPU too. Measured there (two cores with other jobs beside, antmaze-medium, MuJoCo C, 3
+members of preset cpu and 9 of preset smoke): the online phase of members in one program takes about half the time of
+members in turn, since its batches of simulations are larger and its many small steps are made once for all; skills took
+about the same. Nine members of preset cpu were not measured.
 """
 
 from __future__ import annotations
