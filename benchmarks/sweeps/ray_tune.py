@@ -11,9 +11,10 @@ names, has room for; on a cluster this checkout and --out lie on a disk of all n
 together as one program.
 
 Ray is told the success of the last evaluation, the mean over the seeds, while a trial runs. With --stop-early it stops
-those that are behind (ASHA). A trial that is stopped gets SIGTERM, saves and ends; so it is with Ctrl-C, where Ray
-waits 10 seconds before it kills, which costs the work since the last checkpoint. The same command again goes on with
-what has not ended, exactly where it was. When all have ended:
+those that are behind (ASHA). A trial that is stopped gets SIGTERM, saves and ends; so it is with Ctrl-C. The same
+command again goes on with what has not ended, exactly where it was. (Where a cluster was started by hand, set
+RAY_kill_child_processes_on_worker_exit=0 for ``ray start``: else Ray kills a trial that takes more than 10 seconds to
+save, which costs the work since the last checkpoint, and no more.) When all have ended:
 
     python -m qdos_brax report runs/sweep/trials/* --out runs/sweep/report
 """
@@ -189,11 +190,13 @@ def sweep(
     args: argparse.Namespace, flags: Sequence[str], space: Mapping[str, tuple[str, float, float] | list[str]]
 ) -> int:
     """Runs the trials, or goes on with those that have not ended; the exit code."""
-    # Nothing is sent to Ray's makers; and what a trial measured lies in its own folder, once.
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
+    os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")  # train.py writes TensorBoard's files and CSVs
+    # Whoever stops all is not waited for longer than 10 seconds; a run whose worker is gone still saves, and ends.
+    os.environ.setdefault("RAY_kill_child_processes_on_worker_exit", "0")
     try:
         from ray import tune
+        from ray.tune.logger import JsonLoggerCallback
         from ray.tune.schedulers import ASHAScheduler
     except ImportError as error:
         raise UserError('Ray Tune is not installed; install it with: pip install "ray[tune]"') from error
@@ -231,17 +234,25 @@ def sweep(
             run_config=tune.RunConfig(
                 name="ray",
                 storage_path=str(out),
+                callbacks=[JsonLoggerCallback()],
                 failure_config=tune.FailureConfig(max_failures=_RETRIES),
                 checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),  # train.py saves, in its own folder
             ),
         )
     results = tuner.fit()
+    ended = 0
     for result in results:
         metrics = result.metrics or {}
-        how = f"failed: {result.error}" if result.error else f"success {metrics.get('success', math.nan):.2f}"
+        how = f"success {metrics.get('success', math.nan):.2f}"
+        if result.error:
+            how = f"failed: {result.error}"
+        elif not metrics.get("done"):
+            how += ", not ended; the same command again goes on"
+        else:
+            ended += 1
         print(f"{metrics.get('trial_id')}: {' '.join(settings(result.config)[1::2])}, {how}")
     print(f"report    python -m qdos_brax report {out}/trials/* --out {out}/report", flush=True)
-    return 1 if results.num_errors else 0
+    return 0 if ended == len(results) else 1
 
 
 def same_as_before(path: Path, asked: dict[str, Any]) -> None:
