@@ -11,8 +11,8 @@ names, has room for; on a cluster this checkout and --out lie on a disk of all n
 together as one program.
 
 Ray is told the success of the last evaluation, the mean over the seeds, while a trial runs. With --stop-early it stops
-those that are behind (ASHA). A trial that is stopped gets SIGTERM, saves and ends; so it is with Ctrl-C. The same
-command again goes on with what has not ended, exactly where it was. (Where a cluster was started by hand, set
+those that are behind (ASHA). A trial that is stopped gets SIGTERM, saves and ends; so do all on Ctrl-C or SIGTERM. The
+same command again goes on with what has not ended, exactly where it was. (Where a cluster was started by hand, set
 RAY_kill_child_processes_on_worker_exit=0 for ``ray start``: else Ray kills a trial that takes more than 10 seconds to
 save, which costs the work since the last checkpoint, and no more.) When all have ended:
 
@@ -59,7 +59,7 @@ class Run:
         self.folder = RunFolder(folder)
         self.log = folder.with_name(f"{folder.name}.log")  # beside it, since a new run wants an empty folder
         folder.parent.mkdir(parents=True, exist_ok=True)
-        while folder.exists() and self.folder.is_held():  # by the process of a worker that was lost: it soon ends
+        while folder.exists() and self.folder.is_held():  # by the run of a worker that was lost, which goes on alone
             time.sleep(_POLL)
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
@@ -192,9 +192,10 @@ def sweep(
     """Runs the trials, or goes on with those that have not ended; the exit code."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
     os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")  # train.py writes TensorBoard's files and CSVs
-    # Whoever stops all is not waited for longer than 10 seconds; a run whose worker is gone still saves, and ends.
+    # Ray waits 10 seconds for those it stops at the end; a run whose worker is gone by then still saves.
     os.environ.setdefault("RAY_kill_child_processes_on_worker_exit", "0")
     try:
+        import ray
         from ray import tune
         from ray.tune.logger import JsonLoggerCallback
         from ray.tune.schedulers import ASHAScheduler
@@ -203,6 +204,8 @@ def sweep(
     out = args.out.resolve()
     same_as_before(out / "sweep.json", {"set": args.set, "samples": args.samples, "flags": list(flags)})
     cwd = os.getcwd()
+    ray.init()
+    signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))  # Tune handles that one
 
     class Trial(tune.Trainable):
         """A run as Ray sees it."""
