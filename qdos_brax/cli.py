@@ -114,7 +114,7 @@ def train_parser() -> Parser:
         "the variables of Slurm, Open MPI or Kubernetes, or by the three flags below",
     )
     parser.add_argument("--coordinator", metavar="HOST:PORT", help="where the first process can be met")
-    parser.add_argument("--processes", metavar="N", type=_positive, help="how many processes there are")
+    parser.add_argument("--processes", metavar="N", type=positive, help="how many processes there are")
     parser.add_argument("--process-id", metavar="I", type=_index, help="the number of this one, from 0")
     parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
     return parser
@@ -218,9 +218,7 @@ def main_parser(argv: Sequence[str]) -> Parser:
 
     evaluate = commands.add_parser("evaluate", help="evaluate the policy of a run")
     evaluate.add_argument("runs", metavar="RUN", nargs="+", help="a run folder")
-    evaluate.add_argument(
-        "--episodes", metavar="N", type=_positive, default=20, help="episodes per member (default 20)"
-    )
+    evaluate.add_argument("--episodes", metavar="N", type=positive, default=20, help="episodes per member (default 20)")
     evaluate.add_argument(
         "--video", metavar="FILE", help="also film the first member's first episode, as .mp4; takes one RUN"
     )
@@ -317,7 +315,7 @@ def _doctor(args: argparse.Namespace) -> int:
     return 0 if examine() else 1
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
     number = int(text) if text.isdigit() else 0
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1, not {text!r}")

@@ -91,7 +91,7 @@ def plan(need: Estimate, members: int, devices: Sequence[jax.Device], room: int,
 
     Args:
         need: of the run.
-        members: how many.
+        members: how many, at least two.
         devices: all of one kind.
         room: bytes that one of them has, or the host where they are its cores.
         wanted: members per program that the user or the run's first process chose; 0 for none.
@@ -104,11 +104,10 @@ def plan(need: Estimate, members: int, devices: Sequence[jax.Device], room: int,
     parked = devices[0].platform != "cpu" and per_program < most and together > _ROOM * room
     slots = per_program * min(len(devices), -(-members // per_program))
     turns = -(-members // slots)
-    words = [f"{members} members" if members > 1 else "1 member"]
-    if members > 1:
-        words.append("all in one program" if turns == 1 and slots > 1 else f"{slots} at a time, in {turns} turns")
-        if len(devices) > 1:
-            words.append(f"over {min(len(devices), members)} devices")
+    words = [f"{members} members"]
+    words.append("all in one program" if turns == 1 and slots > 1 else f"{slots} at a time, in {turns} turns")
+    if len(devices) > 1:
+        words.append(f"over {min(len(devices), members)} devices")
     words.append(f"about {_size(need.shared)} of data and {_size(each)} per member, of {_size(room)}")
     if parked:
         words.append("states wait in host memory")

@@ -81,7 +81,8 @@ class Population:
         return sharded
 
     def _in_turn(self, compiled: Callable[..., Any], carries: bool, *args: Any) -> Any:
-        own, shared = args[:-1], args[-1]
+        # What was made from the shared data lies on all devices, and one program takes from one place alone.
+        own, shared = jax.device_put(args[:-1], self._home), args[-1]
         results = []
         for first in range(0, self.members, self._slots):
             # Slots beyond the last member are filled with it, and what becomes of them is dropped.

@@ -103,6 +103,10 @@ keys = jax.random.split(jax.random.key(0), 4)
 one = Population({"rate": np.zeros(4)}, 1).program(play)(keys, None)
 two = Population({"rate": np.zeros(4)}, 1, jax.local_devices()).program(play)(keys, None)
 np.testing.assert_array_equal(one, two)
+
+turns = Population({"rate": np.zeros(4)}, 1, jax.local_devices())
+everywhere = turns.shared(np.arange(4.0))  # as what is made from the data set
+np.testing.assert_array_equal(turns.program(lambda key, x, _: x + 1)(keys, everywhere, None), np.arange(4.0) + 1)
 print("the same")
 """
 

@@ -98,7 +98,7 @@ def drawn(values: Mapping[str, Any]) -> dict[str, Any]:
         UserError: a distribution is wrong or not wanted, or there are fewer settings than asked for.
     """
     scannable = [key for key, field in leaves(Config) if field.metadata["scan"] and key in values]
-    written = {key: _distribution(key, values[key]) for key in scannable}
+    written = {key: distribution(key, values[key]) for key in scannable}
     wanted = {key: found for key, found in written.items() if found is not None}
     count = values_in("scan.samples", values.get("scan.samples", 0), whole=True)[0]
     if not count:
@@ -128,6 +128,19 @@ def drawn(values: Mapping[str, Any]) -> dict[str, Any]:
     return {**values, **{key: list(column) for key, column in zip(streams, columns, strict=True)}}
 
 
+def distribution(key: str, value: Any) -> tuple[str, float, float] | None:
+    """(name, low, high) of "name(low,high)"; None of what is no such text."""
+    match = _DISTRIBUTION.fullmatch(value) if isinstance(value, str) else None
+    if match is None:
+        return None
+    name, (low, high) = match[1], (values_in(key, text)[0] for text in match.groups()[1:])
+    if name not in ("uniform", "loguniform"):
+        raise UserError(f"{key}: there is no distribution {name!r}; there are uniform(a,b) and loguniform(a,b)")
+    if not low < high or (name == "loguniform" and low <= 0):
+        raise UserError(f"{key}={value} wants {'0 < ' if name == 'loguniform' else ''}a < b")
+    return name, low, high
+
+
 def _varied(config: Config) -> dict[str, tuple[Any, ...]]:
     """The seeds, alpha, and every other field that holds several values."""
     alpha = config.skills.alpha
@@ -144,19 +157,6 @@ def _pairs(varied: Mapping[str, tuple[Any, ...]]) -> Iterator[tuple[tuple[str, A
     count = max((len(values) for values in varied.values()), default=1)
     for index in range(count):
         yield tuple((key, values[index % len(values)]) for key, values in varied.items())
-
-
-def _distribution(key: str, value: Any) -> tuple[str, float, float] | None:
-    """(name, low, high) of "name(low,high)"; None of what is no such text."""
-    match = _DISTRIBUTION.fullmatch(value) if isinstance(value, str) else None
-    if match is None:
-        return None
-    name, (low, high) = match[1], (values_in(key, text)[0] for text in match.groups()[1:])
-    if name not in ("uniform", "loguniform"):
-        raise UserError(f"{key}: there is no distribution {name!r}; there are uniform(a,b) and loguniform(a,b)")
-    if not low < high or (name == "loguniform" and low <= 0):
-        raise UserError(f"{key}={value} wants {'0 < ' if name == 'loguniform' else ''}a < b")
-    return name, low, high
 
 
 def _draws(name: str, low: float, high: float, stream: np.random.Generator) -> Iterator[float]:

@@ -91,11 +91,13 @@ def build_phases(config: Config, env: Any, dataset: Dataset, population: Populat
 
 
 def plan_members(config: Config, env: Any, dataset: Dataset, members: Sequence[Mapping[str, Any]]) -> memory.Plan:
-    """How the members run on this process's devices, by an estimate of their memory.
+    """How the members run on this process's devices, by an estimate of their memory where there is a choice.
 
     Raises:
         UserError: the data cannot serve this configuration.
     """
+    if len(members) == 1:
+        return memory.Plan(1, False, "1 member")
     one = Population(configs.population_hyper(config, members[:1]))
     shared = sum(value.nbytes for value in vars(dataset).values() if isinstance(value, np.ndarray))
     need = memory.estimate(build_phases(config, env, dataset, one), shared)

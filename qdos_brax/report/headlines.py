@@ -64,7 +64,11 @@ def _sure(order: list[tuple[Setting, list[float]]]) -> Card:
     (best, ours), (second, theirs) = order[:2]
     chance, low, high = probability_of_improvement([ours], [theirs])
     between = "" if math.isnan(low) else f" (95 % interval: {low:.2f} to {high:.2f})"
-    text = f"A seed of {best.label} beats one of {second.label} with a chance of {chance:.2f}{between}."
+    if math.isclose(chance, 0.5):  # "beats with a chance of 0.50" would sound like a finding
+        between = between.replace("interval", "interval of the chance that a seed of the first is better")
+        text = f"No difference was seen between {best.label} and {second.label}{between}."
+    else:
+        text = f"A seed of {best.label} beats one of {second.label} with a chance of {chance:.2f}{between}."
     if min(len(ours), len(theirs)) < _ENOUGH and not math.isnan(low):
         text += " Intervals of so few seeds are too narrow."
     if math.isnan(low):

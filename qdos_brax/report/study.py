@@ -216,7 +216,7 @@ def _settings(members: Sequence[Member]) -> list[Setting]:
     settings: dict[tuple[str, ...], Setting] = {}
     for member in members:
         values = {key: member.values[key] for key in varied[member.method]}
-        named = values if len(values) <= _MOST_NAMED else {"run": member.run}
+        named = _named(member, values, members)
         label = ", ".join([member.method, *(f"{short(key)} {plain(value)}" for key, value in named.items())])
         setting = settings.setdefault((label, *map(str, values.values())), Setting(label, member.method, values, {}))
         others = setting.members.setdefault(member.task, [])
@@ -226,6 +226,16 @@ def _settings(members: Sequence[Member]) -> list[Setting]:
                 raise UserError(f"{other.run} and {member.run} both hold {where}; leave one out")
         others.append(member)
     return list(settings.values())
+
+
+def _named(member: Member, values: dict[str, Any], members: Sequence[Member]) -> dict[str, Any]:
+    """What a label tells of a member: its values; of many values those that vary within its run, and the run."""
+    if len(values) <= _MOST_NAMED:
+        return values
+    others = [other for other in members if other.method == member.method]
+    own = [other for other in others if other.run == member.run]
+    scanned = {key: value for key, value in values.items() if any(other.values[key] != value for other in own)}
+    return scanned if len(own) == len(others) else {"run": member.run, **scanned}
 
 
 def _varied(members: Sequence[Member], method: str) -> list[str]:

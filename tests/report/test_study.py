@@ -55,6 +55,18 @@ def test_runs_that_differ_in_much_are_named_by_their_folders(tmp_path: Path) -> 
     assert labels(a, b) == {f"qdos, run {a}": 1, f"qdos, run {b}": 1}
 
 
+def test_settings_of_a_scan_of_many_keys_have_names_of_their_own(tmp_path: Path) -> None:
+    scan = write_run(tmp_path / "a", success={0.1: [0.5], 0.3: [0.7]})
+    vary(scan, kl_weight=[1.0, 2.0], latent_box=[2.0, 3.0], advantage_temperature=[0.5, 4.0])
+    own = {
+        "kl weight 1, advantage temperature 0.5, alpha 0.1, latent box 2",
+        "kl weight 2, advantage temperature 4, alpha 0.3, latent box 3",
+    }
+    assert set(labels(scan)) == {f"qdos, {named}" for named in own}
+    other = write_run(tmp_path / "b", success=[0.5])
+    assert set(labels(scan, other)) == {f"qdos, run {other}", *(f"qdos, run {scan}, {named}" for named in own)}
+
+
 def test_tables_by_hand(tmp_path: Path) -> None:
     goals = [10_000, 10_000, 20_000]
     runs = [
@@ -138,6 +150,7 @@ def test_headlines_by_hand(tmp_path: Path) -> None:
     even = write_run(tmp_path / "e", "supe", [0.9, 0.8, 1.0])
     best, sure, fastest, _ = cards(read_study([q, even]))
     assert "2 settings" in best.value and sure.value == "not told apart"
+    assert sure.text.startswith("No difference was seen between qdos and supe (95 % interval of the chance")
     nothing = write_run(tmp_path / "n", success=[0.0])
     best, sure, fastest, _ = cards(read_study([nothing]))
     assert (best.value, fastest.value) == ("none", "none") and "nothing to compare" in sure.text

@@ -1,0 +1,275 @@
+"""A sweep larger than one job, on Ray Tune: every trial is one ``train.py`` with one setting and all its seeds.
+
+    pip install "ray[tune]"
+    python benchmarks/sweeps/ray_tune.py --out runs/sweep --set skills.alpha=0.1,0.3 \
+        --set "skills.kl_weight=loguniform(0.02,0.5)" --samples 8 --gpus 1 --stop-early 20000 \
+        --env antmaze-large --seed 0,1,2,3
+
+runs 16 trials: of every alpha 8, each with a KL weight of its own. What this script does not know (here --env and
+--seed) goes to train.py as it is. Ray starts as many trials at once as the machine, or the cluster that RAY_ADDRESS
+names, has room for; on a cluster this checkout and --out lie on a disk of all nodes. The seeds of a trial train
+together as one program.
+
+Ray is told the success of the last evaluation, the mean over the seeds, while a trial runs. With --stop-early it stops
+those that are behind (ASHA). A trial that is stopped gets SIGTERM, saves and ends; so do all on Ctrl-C or SIGTERM. The
+same command again goes on with what has not ended, exactly where it was. (Where a cluster was started by hand, set
+RAY_kill_child_processes_on_worker_exit=0 for ``ray start``: else Ray kills a trial that takes more than 10 seconds to
+save, which costs the work since the last checkpoint, and no more.) When all have ended:
+
+    python -m qdos_brax report runs/sweep/trials/* --out runs/sweep/report
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from qdos_brax.cli import Parser, configs_from_args, positive, train_parser
+from qdos_brax.config.scan import distribution
+from qdos_brax.errors import UserError
+from qdos_brax.runs.folder import RunFolder, user_errors, write_text
+from qdos_brax.runs.metrics import read_rows, step_of
+
+TRAIN = Path(__file__).resolve().parents[2] / "train.py"
+_POLL = 0.5
+_HEARTBEAT = 5.0  # seconds until Ray hears of a trial again: while it waits it cannot stop the trial
+_ENDLESS = 10**12  # environment steps; how long a trial is, train.py knows
+_RETRIES = 2  # of a trial whose machine was lost
+
+
+class Run:
+    """One ``train.py`` in a folder of its own, which Ray's worker starts, watches and stops.
+
+    Args:
+        folder: the run folder; where it holds a run already, that one goes on.
+        flags: for train.py, of a new run.
+        cwd: where relative paths among the flags begin.
+    """
+
+    def __init__(self, folder: Path, flags: Sequence[str], cwd: str) -> None:
+        self.folder = RunFolder(folder)
+        self.log = folder.with_name(f"{folder.name}.log")  # beside it, since a new run wants an empty folder
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        while folder.exists() and self.folder.is_held():  # by the run of a worker that was lost, which goes on alone
+            time.sleep(_POLL)
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                command(self.folder, flags), cwd=cwd, stdout=log, stderr=log, start_new_session=True
+            )
+
+    def step(self) -> dict[str, Any]:
+        """What is new: waits for an evaluation, the end, or the heartbeat.
+
+        Returns:
+            "steps" and "success" of the last evaluation (0 and nan before the first), "done".
+
+        Raises:
+            RuntimeError: train.py failed; its last line is the message.
+        """
+        known, deadline = score(self.folder), time.monotonic() + _HEARTBEAT
+        while (code := self.process.poll()) is None and time.monotonic() < deadline and score(self.folder) == known:
+            time.sleep(_POLL)
+        if code:
+            lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+            raise RuntimeError(f"train.py ended with code {code}: {lines[-1] if lines else 'it said nothing'}")
+        steps, success = score(self.folder)
+        return {"steps": steps, "success": success, "done": code == 0}
+
+    def stop(self) -> None:
+        """Lets train.py save and end."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            self.process.wait()
+
+
+def command(folder: RunFolder, flags: Sequence[str]) -> list[str]:
+    """What a trial runs: a new run in the folder, or the one that it holds."""
+    begun = folder.metrics.exists()
+    return [sys.executable, str(TRAIN), *(["--resume"] if begun else [*flags, "--out"]), str(folder.path)]
+
+
+def score(folder: RunFolder) -> tuple[int, float]:
+    """(steps, success) of the last evaluation: environment steps, and the mean over the members, 0..1.
+
+    Steps are updates where a method learns from the data alone. Before the first evaluation they are (0, nan).
+    """
+    if not folder.metrics.exists():
+        return 0, math.nan
+    evaluated = [row for row in read_rows(folder.metrics) if row.get("eval/success")]
+    if not evaluated:
+        return 0, math.nan
+    last = step_of(evaluated[-1])
+    values = [float(row["eval/success"]) for row in evaluated if step_of(row) == last]
+    return last, sum(values) / len(values)
+
+
+def settings(chosen: Mapping[str, Any]) -> list[str]:
+    """The flags of what Ray chose for a trial; numbers drawn have six digits, as a table shows them."""
+    texts = {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in chosen.items()}
+    return [part for key, text in texts.items() for part in ("--set", f"{key}={text}")]
+
+
+def searched(assignments: Sequence[str]) -> dict[str, tuple[str, float, float] | list[str]]:
+    """By dotted key what Ray shall choose from: (name, low, high) of a distribution, or a list.
+
+    Raises:
+        UserError: one is no assignment, or comes twice.
+    """
+    found: dict[str, tuple[str, float, float] | list[str]] = {}
+    for assignment in assignments:
+        key, _, text = (part.strip() for part in assignment.partition("="))
+        if not text:
+            raise UserError(f"--set {assignment}: give KEY=VALUE[,VALUE..] or KEY=loguniform(a,b)")
+        if key in found:
+            raise UserError(f"--set holds {key} twice; give its values as one list")
+        found[key] = distribution(key, text) or [value.strip() for value in text.split(",")]
+    return found
+
+
+def check(flags: Sequence[str], space: Mapping[str, tuple[str, float, float] | list[str]]) -> None:
+    """Reads the flags and every value as train.py will, before any trial starts.
+
+    Raises:
+        UserError: train.py would refuse them, or the flags name a folder or more than one program.
+    """
+    parser = train_parser()
+    args = parser.parse_args(list(flags))
+    if args.env is None:
+        raise UserError("give a task with --env")
+    for name in ("out", "resume", "distributed"):
+        if getattr(args, name):
+            raise UserError(f"--{name} is not for a trial: each has a folder and a process of its own")
+    args.preset = args.preset or "cpu"  # the default would be by this machine's devices, and trials may run on others
+    given = args.set
+    for key, values in space.items():
+        for value in values[1:] if isinstance(values, tuple) else values:
+            args.set = [*given, *settings({key: value})[1:]]
+            if len(configs_from_args(args)) > 1:
+                raise UserError("a trial is one program; give one method, and lists of sizes with this script's --set")
+
+
+def main() -> int:
+    """The command line: 0 if all trials ended well."""
+    parser = Parser(prog="ray_tune.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the sweep")
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUES",
+        action="append",
+        required=True,
+        help="a key of the configuration that Ray chooses: a list, each value tried, or uniform(a,b), loguniform(a,b)",
+    )
+    parser.add_argument(
+        "--samples", metavar="N", type=positive, default=1, help="draws per combination of the lists (default 1)"
+    )
+    parser.add_argument("--cpus", type=float, default=2, help="CPUs that Ray reserves for a trial (default 2)")
+    parser.add_argument("--gpus", type=float, default=0, help="GPUs of a trial (default 0)")
+    parser.add_argument(
+        "--stop-early", metavar="STEPS", type=positive, help="stop trials that are behind, from STEPS on"
+    )
+    args, flags = parser.parse_known_args()
+    try:
+        space = searched(args.set)
+        check(flags, space)
+        return sweep(args, flags, space)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def sweep(
+    args: argparse.Namespace, flags: Sequence[str], space: Mapping[str, tuple[str, float, float] | list[str]]
+) -> int:
+    """Runs the trials, or goes on with those that have not ended; the exit code."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
+    os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")  # train.py writes TensorBoard's files and CSVs
+    # Ray waits 10 seconds for those it stops at the end; a run whose worker is gone by then still saves.
+    os.environ.setdefault("RAY_kill_child_processes_on_worker_exit", "0")
+    try:
+        import ray
+        from ray import tune
+        from ray.tune.logger import JsonLoggerCallback
+        from ray.tune.schedulers import ASHAScheduler
+    except ImportError as error:
+        raise UserError('Ray Tune is not installed; install it with: pip install "ray[tune]"') from error
+    out = args.out.resolve()
+    same_as_before(out / "sweep.json", {"set": args.set, "samples": args.samples, "flags": list(flags)})
+    cwd = os.getcwd()
+    ray.init()
+    signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))  # Tune handles that one
+
+    class Trial(tune.Trainable):
+        """A run as Ray sees it."""
+
+        def setup(self, config: dict[str, Any]) -> None:
+            self._run = Run(out / "trials" / self.trial_id, [*flags, *settings(config)], cwd)
+
+        def step(self) -> dict[str, Any]:
+            return self._run.step()
+
+        def cleanup(self) -> None:
+            self._run.stop()
+
+    trainable = tune.with_resources(Trial, {"cpu": args.cpus, "gpu": args.gpus})
+    state = str(out / "ray")
+    if tune.Tuner.can_restore(state):
+        tuner = tune.Tuner.restore(state, trainable, restart_errored=True)
+    else:
+        early = args.stop_early and ASHAScheduler(time_attr="steps", grace_period=args.stop_early, max_t=_ENDLESS)
+        tuner = tune.Tuner(
+            trainable,
+            param_space={
+                key: tune.grid_search(values) if isinstance(values, list) else getattr(tune, values[0])(*values[1:])
+                for key, values in space.items()
+            },
+            tune_config=tune.TuneConfig(
+                metric="success", mode="max", num_samples=args.samples, scheduler=early or None
+            ),
+            run_config=tune.RunConfig(
+                name="ray",
+                storage_path=str(out),
+                callbacks=[JsonLoggerCallback()],
+                failure_config=tune.FailureConfig(max_failures=_RETRIES),
+                checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),  # train.py saves, in its own folder
+            ),
+        )
+    results = tuner.fit()
+    ended = 0
+    for result in results:
+        metrics = result.metrics or {}
+        how = f"success {metrics.get('success', math.nan):.2f}"
+        if result.error:
+            how = f"failed: {result.error}"
+        elif not metrics.get("done"):
+            how += ", not ended; the same command again goes on"
+        else:
+            ended += 1
+        print(f"{metrics.get('trial_id')}: {' '.join(settings(result.config)[1::2])}, {how}")
+    print(f"report    python -m qdos_brax report {out}/trials/* --out {out}/report", flush=True)
+    return 0 if ended == len(results) else 1
+
+
+def same_as_before(path: Path, asked: dict[str, Any]) -> None:
+    """Writes down what the sweep was asked for, or compares it with what was.
+
+    Raises:
+        UserError: it is another sweep.
+    """
+    if path.exists() and json.loads(path.read_text(encoding="utf-8")) != asked:
+        raise UserError(f"{path.parent} holds a sweep of other settings; give those, or choose another --out")
+    with user_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, json.dumps(asked, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
