@@ -17,7 +17,7 @@ from qdos_brax.experts.poses import humanoid_is_up, standing_humanoid
 YAW_NOISE = 0.3
 """Standard deviation of the angle between where a humanoid faces at first and where it has to go, rad."""
 
-SHARPEST = 0.55
+SHARPEST = 1.0
 """How far from where a humanoid faces it is commanded at most, rad: in a maze it has to turn within a corridor."""
 
 
@@ -77,7 +77,7 @@ HUMANOID = Conduct(
     _on_its_feet,
     is_down=lambda qpos: ~humanoid_is_up(qpos),
     noise=0.1,
-    heavy_noise=0.2,
+    heavy_noise=0.3,
     stitch_steps=400,
 )
 

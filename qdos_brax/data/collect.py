@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,7 @@ PATIENCE_SECONDS = 20.0  # after which a failing attempt turns round in any case
 
 
 class Row(NamedTuple):
-    """A control step.
+    """A control step, or many: arrays of jax, or on the host NumPy's.
 
     Attributes:
         qpos, qvel, observation, action: before it.
@@ -57,12 +57,12 @@ class Row(NamedTuple):
         fell: bool, it brought the body down for good, and the next row is another episode's.
     """
 
-    qpos: jax.Array
-    qvel: jax.Array
-    observation: jax.Array
-    action: jax.Array
-    next_observation: jax.Array
-    fell: jax.Array
+    qpos: Any
+    qvel: Any
+    observation: Any
+    action: Any
+    next_observation: Any
+    fell: Any
 
 
 class Lane(struct.PyTreeNode):

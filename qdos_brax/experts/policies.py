@@ -42,7 +42,7 @@ _SPIN_SCALE = 0.25  # of the root
 _SWING_SCALE = 0.1  # of the joints
 _RISING_SPAN = 2.0  # rad
 
-SHARPEST = 0.4
+SHARPEST = 0.7
 """How far from where it faces a humanoid is commanded at most, rad: the sharper it turns, the more often it falls."""
 
 

@@ -62,6 +62,7 @@ class Task(Protocol):
         discount: per control step.
         life_steps: a life ends after so many.
         turn_every: mean steps between two draws of the direction.
+        shake: standard deviation of the noise on ``joints`` while it learns, against which it has to hold its own.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Task(Protocol):
     discount: float
     life_steps: int
     turn_every: int
+    shake: float
 
     def reset(self, key: jax.Array) -> Life:
         """A new life."""
@@ -98,7 +100,7 @@ class AntWalking:
 
     name = "ant_walker"
     observation_dim, action_dim = 29, 8
-    discount, life_steps, turn_every = 0.99, 10**9, 100
+    discount, life_steps, turn_every, shake = 0.99, 10**9, 100, 0.0
 
     def __init__(self) -> None:
         self.engine = MujocoEngine(models.ant_model(), threads=1)
@@ -140,7 +142,7 @@ class AntDribbling:
 
     name = "ant_dribbler"
     observation_dim, action_dim = 35, 10
-    discount, life_steps, turn_every = 0.98, 300, 80
+    discount, life_steps, turn_every, shake = 0.98, 300, 80, 0.0
 
     LOST = 5.0
     FASTEST = 0.15  # m per control step
@@ -208,7 +210,7 @@ class HumanoidWalking:
 
     name = "humanoid_walker"
     observation_dim, action_dim = 55, 21
-    discount, life_steps, turn_every = 0.99, 300, 400
+    discount, life_steps, turn_every, shake = 0.99, 300, 400, 0.2
 
     PACE = 1.2  # m/s
 
@@ -265,7 +267,7 @@ class HumanoidRising:
 
     name = "humanoid_riser"
     observation_dim, action_dim = 55, 21
-    discount, life_steps, turn_every = 0.99, 300, 10**9
+    discount, life_steps, turn_every, shake = 0.99, 300, 10**9, 0.0
 
     STANDING_SHARE = 0.25
     PUSH = 0.5  # standard deviation of the velocities at a start on its feet, m/s and rad/s
