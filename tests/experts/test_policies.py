@@ -115,7 +115,6 @@ def test_the_dribbler_scores() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="after 1,152,000 steps of training: 0.956 m/s, and 0.172 fell")
 def test_the_humanoid_walks() -> None:
     """64 episodes of 1,000 steps from standing, each along a direction of its own, without noise."""
     task, walker, episodes = HumanoidWalking(), policies.humanoid_walker(), 64
