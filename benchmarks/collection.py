@@ -19,18 +19,20 @@ import jax
 import jax.numpy as jnp
 
 import envs
-from qdos_brax.data.collect import CHUNK_STEPS, Collector, shipped_expert
+from qdos_brax.data.bodies import conduct_of
+from qdos_brax.data.collect import CHUNK_STEPS, Collector
 from qdos_brax.data.recipes import degraded, episode_kinds
 from qdos_brax.runs.folder import write_text
 
-TASKS = ("antmaze-large", "antsoccer-arena")
+TASKS = ("antmaze-large", "antsoccer-arena", "humanoidmaze-medium")
 
 
 def measure(task: str, num_envs: int, turns: int) -> dict[str, Any]:
     """Steps per second of both, and the share, over ``turns`` chunks of CHUNK_STEPS steps of every environment."""
     env = envs.make(task, physics="mujoco")
-    recipe = degraded(0.5)
-    collector = Collector(env, shipped_expert(env), recipe)
+    body = conduct_of(env)
+    recipe = degraded(0.5, body)
+    collector = Collector(env, body.expert(), recipe)
     kinds = jnp.asarray(episode_kinds(recipe.mix, num_envs, seed=0))
     lanes = collector._reset(jax.random.split(jax.random.key(0), num_envs))
 
@@ -49,7 +51,7 @@ def measure(task: str, num_envs: int, turns: int) -> dict[str, Any]:
         lanes, rows = collector._chunk(lanes, kinds, keys)
         rows = jax.device_get(rows)
         halfway = time.perf_counter()
-        jax.block_until_ready(bare(start, rows[3]))
+        jax.block_until_ready(bare(start, rows.action))
         collecting.append(halfway - began)
         stepping.append(time.perf_counter() - halfway)
     steps = num_envs * CHUNK_STEPS

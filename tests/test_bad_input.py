@@ -101,7 +101,6 @@ OTHERS = [
     "data fetch nosuch",
     "data make antmaze-medium --out {new}.npz",
     "data make nosuch --out {new}.hdf5",
-    "data make humanoidmaze-medium --out {new}.hdf5",
     "data make antmaze-medium --out {new}.hdf5 --transitions 3",
     "data make antmaze-medium --out {new}.hdf5 --degraded-share 2",
     "data make antmaze-medium --out {new}.hdf5 --mix expert=0.5,nosuch=0.5",

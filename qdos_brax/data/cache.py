@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import qdos_brax
 from envs.task import TaskEnv
-from qdos_brax.data import collect, formats, recipes
+from qdos_brax.data import bodies, collect, formats, recipes
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
 from qdos_brax.experts import policies
@@ -45,8 +45,9 @@ def default_dataset(
     Raises:
         UserError: a parameter is out of range, no expert is shipped for the body, or the folder cannot be written.
     """
-    policy = collect.shipped_expert(env)
-    recipe = recipes.degraded(degraded_share, noise)
+    body = bodies.conduct_of(env)
+    policy = body.expert()
+    recipe = recipes.degraded(degraded_share, body, noise)
     parameters = f"n{transitions}-bad{degraded_share:g}-noise{noise:g}-seed{seed}-envs{num_envs}"
     version = f"{env.backend}-v{collect.RECIPE}-{policies.digest(policy)}"
     path = folder() / f"{env.spec.name}-{parameters}-{version}.hdf5"
@@ -69,7 +70,7 @@ def make_file(
     policy: policies.Policy | None = None,
 ) -> None:
     """Collects a set (see ``collect.collect``) with a progress bar; writes it to ``path`` with where it came from."""
-    policy = policy or collect.shipped_expert(env)
+    policy = policy or bodies.conduct_of(env).expert()
     collect.check_size(transitions, seed, num_envs)  # before there is a bar
     with tqdm(total=transitions, unit="steps", unit_scale=True, desc="collect", file=sys.stderr) as bar:
 
@@ -84,6 +85,7 @@ def make_file(
         "recipe": recipe.name,
         "mix": recipes.mix_text(recipe.mix),
         "noise": recipe.noise,
+        "heavy_noise": recipe.heavy_noise,
         "num_envs": num_envs,
         "physics": env.backend,
         "expert": policies.digest(policy),
@@ -91,7 +93,16 @@ def make_file(
         "version": collect.RECIPE,
         "packages": f"qdos-brax {qdos_brax.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}",
     }
+    if "infos/fell" in rows:
+        attributes["falls"] = _falls(rows)
     formats.write_hdf5(path, rows, attributes)
+
+
+def _falls(rows: dict[str, np.ndarray]) -> str:
+    """As "navigate=7/40 noisy=31/35": episodes of each behaviour that a fall ended, of how many."""
+    kinds, fell = rows["infos/quality"][rows["timeouts"]], rows["infos/fell"][rows["timeouts"]]
+    counts = {name: kinds == code for name, code in QUALITY.items()}
+    return " ".join(f"{name}={(fell & chosen).sum()}/{chosen.sum()}" for name, chosen in counts.items() if chosen.any())
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from envs.physics.base import PipelineState
 from envs.render import steps_per_second
 from envs.soccer import BALL_QPOS
 from envs.task import GOAL_TOLERANCE, START_NOISE, TaskEnv
+from qdos_brax.data import bodies
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.data.recipes import Recipe, episode_kinds, named
 from qdos_brax.errors import UserError
@@ -31,7 +33,6 @@ from qdos_brax.experts.views import random_direction
 RECIPE = 3
 """Version of what is collected; part of the cache's file names, as are the experts' weights."""
 
-HEAVY_NOISE = 1.0  # standard deviation of action noise in noisy episodes
 WANDER_SECONDS = 3.0  # mean time between two draws of a wanderer's direction, where the recipe does not say
 CHUNK_STEPS = 50  # steps per call of the jitted program; the episode length is a multiple of it
 SHORTEST_EPISODE = 200
@@ -47,8 +48,21 @@ WITH_BALL = 0.5  # share of soccer's short episodes (stitch) that have anything 
 PATIENCE_SECONDS = 20.0  # after which a failing attempt turns round in any case
 
 
-Row = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-"""qpos, qvel, observation and action of a step, all before it."""
+class Row(NamedTuple):
+    """A control step, or many: arrays of jax, or on the host NumPy's.
+
+    Attributes:
+        qpos, qvel, observation, action: before it.
+        next_observation: after it.
+        fell: bool, it brought the body down for good, and the next row is another episode's.
+    """
+
+    qpos: Any
+    qvel: Any
+    observation: Any
+    action: Any
+    next_observation: Any
+    fell: Any
 
 
 class Lane(struct.PyTreeNode):
@@ -63,7 +77,7 @@ class Lane(struct.PyTreeNode):
         attempt: int32, steps since the goal was drawn or the attempt turned.
         heading: float32[2], a wanderer's direction.
         away_xy: float32[2], escape: int32, where a body that was stuck walks, and for how many steps more.
-        arrivals: int32, goals that the cargo was brought to.
+        arrivals: int32, goals that the cargo was brought to, in all episodes of the lane.
         clock: int32, steps in this episode; seen_body, seen_cargo: float32[2], positions at the last stuck check.
     """
 
@@ -105,13 +119,14 @@ def collect(
 
     Returns:
         Rows in D4RL's flat layout, keyed as in the file (``infos/qpos``), with true ``next_observations``. No row is
-        terminal: episodes go on after a success and end by time.
+        terminal: episodes go on after a success and end by time, or where the body fell for good
+        (``infos/fell``, of bodies that can).
 
     Raises:
         UserError: an argument out of range, or a body that no expert is shipped for.
     """
     check_size(transitions, seed, num_envs)
-    expert = policy or shipped_expert(env)
+    expert = policy or bodies.conduct_of(env).expert()
     length = recipe.episode_steps or _episode_length(transitions, num_envs, env.episode_length)
     episodes = -(-transitions // length)
     rounds = -(-episodes // num_envs)
@@ -152,27 +167,9 @@ def goals_per_1000(env: TaskEnv, policy: policies.Policy, noise: float, seed: in
         seed: of everything random.
         episodes: how many, of 1,000 steps each.
     """
-    collector = Collector(env, policy, named("navigate", noise))
+    collector = Collector(env, policy, named("navigate", bodies.conduct_of(env), noise))
     kinds = np.full(episodes, QUALITY["navigate"], np.int8)
     return float(np.mean(collector.run(jax.random.key(seed), kinds, 1000)[1].arrivals))
-
-
-def shipped_expert(env: TaskEnv) -> policies.Policy:
-    """The expert that moves the task's body, and its ball if it has one.
-
-    Raises:
-        UserError: none is shipped.
-    """
-    experts: dict[str, Callable[[], policies.Policy]] = {
-        "antmaze": policies.ant_walker,
-        "antsoccer": policies.ant_dribbler,
-    }
-    if env.spec.family not in experts:
-        raise UserError(
-            f"no expert is shipped for {env.spec.family}, so no data can be collected; "
-            f"train with --dataset FILE, such as OGBench's {env.spec.name}-navigate-v0.npz"
-        )
-    return experts[env.spec.family]()
 
 
 class Collector:
@@ -185,13 +182,14 @@ class Collector:
     """
 
     def __init__(self, env: TaskEnv, policy: policies.Policy, recipe: Recipe) -> None:
-        self.env, self.recipe = env, recipe
+        self.env, self.recipe, self.body = env, recipe, bodies.conduct_of(env)
         self.dribbler = policy if isinstance(policy, policies.Dribbles) else None
         self.walker = policy.walker if isinstance(policy, policies.Dribbles) else policy
         self.navigator = Navigator(env.layout)
         rate = steps_per_second(env)
         self.check_steps, self.escape_steps = round(CHECK_SECONDS * rate), round(ESCAPE_SECONDS * rate)
         self.wander_steps, self.patience = round(WANDER_SECONDS * rate), round(PATIENCE_SECONDS * rate)
+        self.heading_steps = recipe.heading_seconds and round(recipe.heading_seconds * rate)
 
     def episodes(
         self, key: jax.Array, kinds: np.ndarray, length: int, progress: Callable[[int], None] | None = None
@@ -202,7 +200,10 @@ class Collector:
     def run(
         self, key: jax.Array, kinds: np.ndarray, length: int, progress: Callable[[int], None] | None = None
     ) -> tuple[dict[str, np.ndarray], Lane]:
-        """An episode of ``length`` steps (a multiple of CHUNK_STEPS) per entry of ``kinds[L]``: rows, last states."""
+        """``length`` steps (a multiple of CHUNK_STEPS) per entry of ``kinds[L]``: rows, last states.
+
+        They are one episode, or as many more as falls ended, all of the same kind.
+        """
         n = len(kinds)
         reset_key, chunk_key = jax.random.split(key)
         lanes = self._reset(jax.random.split(reset_key, n))
@@ -213,19 +214,20 @@ class Collector:
             chunks.append(jax.device_get(rows))
             if progress is not None:
                 progress((index + 1) * CHUNK_STEPS * n)
-        qpos, qvel, observations, actions = (np.concatenate(part, axis=1) for part in zip(*chunks, strict=True))
-        after = np.asarray(lanes.observation)
-        ends = np.zeros((n, length), bool)
+        steps = Row(*(np.concatenate(part, axis=1) for part in zip(*chunks, strict=True)))
+        ends = steps.fell.copy()
         ends[:, -1] = True
         rows = {
-            "observations": observations,
-            "actions": actions,
-            "next_observations": np.concatenate([observations[:, 1:], after[:, None]], axis=1),
+            "observations": steps.observation,
+            "actions": steps.action,
+            "next_observations": steps.next_observation,
             "timeouts": ends,
-            "infos/qpos": qpos,
-            "infos/qvel": qvel,
+            "infos/qpos": steps.qpos,
+            "infos/qvel": steps.qvel,
             "infos/quality": np.repeat(kinds[:, None], length, axis=1),
         }
+        if self.body.is_down is not None:
+            rows["infos/fell"] = steps.fell
         return {name: value.reshape(n * length, *value.shape[2:]) for name, value in rows.items()}, lanes
 
     @partial(jax.jit, static_argnums=0)
@@ -237,17 +239,30 @@ class Collector:
         """CHUNK_STEPS steps of every lane; rows as [L, CHUNK_STEPS, ...]."""
 
         def step(lanes: Lane, keys: jax.Array) -> tuple[Lane, Row]:
-            return jax.vmap(self._step_lane)(lanes, kinds, keys)
+            uses = jax.vmap(lambda key: jax.random.split(key, 4))(keys)
+            lanes, row = jax.vmap(self._step_lane)(lanes, kinds, uses[:, :3])
+            return self._restart(lanes, row.fell, uses[:, 3]), row
 
         by_step = jax.vmap(lambda key: jax.random.split(key, CHUNK_STEPS), out_axes=1)(keys)
         lanes, rows = jax.lax.scan(step, lanes, by_step)
         return lanes, jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), rows)
 
+    def _restart(self, lanes: Lane, fell: jax.Array, keys: jax.Array) -> Lane:
+        """New episodes in the lanes that ``fell[L]``."""
+        if self.body.is_down is None:
+            return lanes
+
+        def some(lanes: Lane) -> Lane:
+            fresh = jax.vmap(self._reset_lane)(keys).replace(arrivals=lanes.arrivals)
+            chosen = lambda a, b: jnp.where(fell.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
+            return jax.tree.map(chosen, fresh, lanes)
+
+        return jax.lax.cond(fell.any(), some, lambda lanes: lanes, lanes)  # most steps see no fall
+
     def _reset_lane(self, key: jax.Array) -> Lane:
-        """Everything at random free cells, with the task's reset noise; the first goal is drawn."""
+        """Everything at random free cells, with the body's reset noise; the first goal is drawn."""
         reset_key, body_key, ball_key, goal_key, heading_key = jax.random.split(key, 5)
-        start = self.env.reset(reset_key).pipeline_state
-        qpos = start.qpos.at[:2].set(self._start_xy(body_key))
+        body = cargo = self._start_xy(body_key)
         has_ball = jnp.asarray(self.dribbler is not None)
         if self.dribbler is not None:
             share_key, ball_key = jax.random.split(ball_key)
@@ -255,16 +270,20 @@ class Collector:
             if self.recipe.goal_cells is not None:  # a short episode: about the ball if it begins at it
                 has_ball = jax.random.uniform(share_key) < WITH_BALL
                 shift = jax.random.uniform(ball_key, (2,), minval=-START_NOISE, maxval=START_NOISE)
-                beside = self.navigator.centre(self.navigator.cell(qpos[:2])) + shift
+                beside = self.navigator.centre(self.navigator.cell(body)) + shift
                 ball_xy = jnp.where(has_ball, beside, ball_xy)
+            cargo = jnp.where(has_ball, ball_xy, body)
+        goal_xy = self._goal_xy(goal_key, cargo)
+        qpos, qvel = self.body.start(self.env, maze_direction(self.navigator, body, goal_xy), reset_key)
+        qpos = qpos.at[:2].set(body)
+        if self.dribbler is not None:
             qpos = qpos.at[BALL_QPOS : BALL_QPOS + 2].set(ball_xy)
-        body, cargo = self._positions(qpos, has_ball)
-        pipeline = self.env.engine.init(qpos, start.qvel)
+        pipeline = self.env.engine.init(qpos, qvel)
         return Lane(
             pipeline=pipeline,
             observation=self.env.observe(pipeline),
             has_ball=has_ball,
-            goal_xy=self._goal_xy(goal_key, cargo),
+            goal_xy=goal_xy,
             origin_xy=cargo,
             turned=jnp.zeros((), bool),
             attempt=jnp.zeros((), jnp.int32),
@@ -295,18 +314,21 @@ class Collector:
             return body, body
         return body, jnp.where(has_ball, qpos[BALL_QPOS : BALL_QPOS + 2], body)
 
-    def _step_lane(self, lane: Lane, kind: jax.Array, key: jax.Array) -> tuple[Lane, Row]:
-        plan_key, noise_key, teleport_key = jax.random.split(key, 3)
+    def _step_lane(self, lane: Lane, kind: jax.Array, keys: jax.Array) -> tuple[Lane, Row]:
+        """A control step, with ``keys[3]`` for plans, noise and teleporters."""
+        plan_key, noise_key, teleport_key = keys
         lane = self._plan(lane, kind, plan_key)
         qpos, qvel = lane.pipeline.qpos, lane.pipeline.qvel
         action = self._action(lane, kind)
-        sigma = jnp.where(kind == QUALITY["noisy"], HEAVY_NOISE, self.recipe.noise)
+        sigma = jnp.where(kind == QUALITY["noisy"], self.recipe.heavy_noise, self.recipe.noise)
         action = jnp.clip(action + sigma * jax.random.normal(noise_key, action.shape), -1.0, 1.0)
-        row = (qpos, qvel, lane.observation, action)
         pipeline = self.env.engine.step(lane.pipeline, action)
+        after = self.env.observe(pipeline)
+        fell = jnp.zeros((), bool) if self.body.is_down is None else self.body.is_down(pipeline.qpos)
+        row = Row(qpos, qvel, lane.observation, action, after, fell)
         lane = lane.replace(
             pipeline=self.env.teleport(pipeline, teleport_key),
-            observation=self.env.observe(pipeline),  # still at the entrance, as the task's own step shows it
+            observation=after,  # still at the entrance, as the task's own step shows it
             attempt=lane.attempt + 1,
             clock=lane.clock + 1,
             escape=jnp.maximum(lane.escape - 1, 0),
@@ -327,10 +349,10 @@ class Collector:
         stuck = checks & self._is_stuck(lane, body, cargo)
         arrived = ~lane.turned & (gap < GOAL_TOLERANCE)
         redraw = undone | stuck | arrived if self.recipe.goal_cells is None else jnp.zeros((), bool)
-        if self.recipe.heading_steps is None:
+        if self.heading_steps is None:
             heads_anew = jax.random.uniform(turn_key) < 1 / self.wander_steps
         else:
-            heads_anew = lane.clock % self.recipe.heading_steps == 0
+            heads_anew = lane.clock % self.heading_steps == 0
         return lane.replace(
             goal_xy=jnp.where(redraw, self._goal_xy(goal_key, cargo), lane.goal_xy),
             origin_xy=jnp.where(redraw, cargo, lane.origin_xy),

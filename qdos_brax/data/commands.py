@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import envs
-from qdos_brax.data import cache, checks, download, formats, recipes, sources
+from qdos_brax.data import bodies, cache, checks, download, formats, recipes, sources
 from qdos_brax.data.dataset import episode_bounds
 from qdos_brax.data.labelling import label
 from qdos_brax.data.quality import QUALITY
@@ -80,22 +80,22 @@ def _make(args: argparse.Namespace) -> int:
     if path.suffix not in (".hdf5", ".h5"):
         raise UserError(f"--out {args.out}: data is written as .hdf5; give the file that ending")
     env = _env(args.task, args.physics)
-    cache.make_file(path, env, args.transitions, _recipe(args), args.seed, args.num_envs)
+    cache.make_file(path, env, args.transitions, _recipe(args, env), args.seed, args.num_envs)
     print(path)
     return 0
 
 
-def _recipe(args: argparse.Namespace) -> recipes.Recipe:
+def _recipe(args: argparse.Namespace, env: envs.TaskEnv) -> recipes.Recipe:
+    body = bodies.conduct_of(env)
     if args.recipe != "mixed":
         if args.mix is not None or args.degraded_share is not None:
             raise UserError(f"--recipe {args.recipe} takes neither --mix nor --degraded-share; mixed does")
-        return recipes.named(args.recipe, args.noise)
-    noise = recipes.NOISE if args.noise is None else args.noise
+        return recipes.named(args.recipe, body, args.noise)
     if args.mix is None:
-        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, noise)
+        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, body, args.noise)
     if args.degraded_share is not None:
         raise UserError("--mix and --degraded-share both say what is mixed; give one of them")
-    return recipes.mixed(recipes.parse_mix(args.mix), noise)
+    return recipes.mixed(recipes.parse_mix(args.mix), body, args.noise)
 
 
 def _fetch(args: argparse.Namespace) -> int:

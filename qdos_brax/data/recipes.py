@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from qdos_brax.data.bodies import Conduct
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
 
@@ -19,8 +20,7 @@ BEHAVIOURS = {"expert": QUALITY["navigate"], **{name: code for name, code in QUA
 
 NAMES = ("navigate", "stitch", "explore", "mixed")
 
-NOISE = 0.2
-EXPLORE_NOISE = 1.0
+EXPLORE_STEPS = 500  # of an episode of explore
 
 
 @dataclass(frozen=True)
@@ -31,21 +31,23 @@ class Recipe:
         name: "navigate", "stitch", "explore" or "mixed".
         mix: share of the episodes of each behaviour; sums to 1.
         noise: standard deviation of the Gaussian noise on actions, but for noisy episodes.
+        heavy_noise: that of noisy episodes.
         episode_steps: length of an episode; None takes the task's cap.
         goal_cells: goals are this many cells away and kept to the end; None draws them anywhere, again on arrival.
-        heading_steps: steps between two draws of a wanderer's direction; None draws at random times.
+        heading_seconds: time between two draws of a wanderer's direction; None draws at random times.
     """
 
     name: str
     mix: Mapping[str, float]
     noise: float
+    heavy_noise: float
     episode_steps: int | None = None
     goal_cells: int | None = None
-    heading_steps: int | None = None
+    heading_seconds: float | None = None
 
 
-def mixed(mix: Mapping[str, float], noise: float = NOISE) -> Recipe:
-    """A mixture of behaviours that go to goals anywhere.
+def mixed(mix: Mapping[str, float], body: Conduct, noise: float | None = None) -> Recipe:
+    """A mixture of behaviours that go to goals anywhere; None takes the body's noise.
 
     Raises:
         UserError: shares are negative or do not sum to 1, a behaviour is unknown, or the noise is negative.
@@ -57,27 +59,31 @@ def mixed(mix: Mapping[str, float], noise: float = NOISE) -> Recipe:
             raise UserError(f"the share of {name} must lie in [0, 1], got {share}")
     if abs(sum(mix.values()) - 1.0) > 1e-6:
         raise UserError(f"the shares of a mix must sum to 1, these sum to {sum(mix.values()):g}: {mix_text(mix)}")
+    noise = body.noise if noise is None else noise
     if not noise >= 0.0:
         raise UserError(f"the action noise must be 0 or more, got {noise}")
-    return Recipe("mixed", mix, noise)
+    return Recipe("mixed", mix, noise, body.heavy_noise)
 
 
-def degraded(share: float, noise: float = NOISE) -> Recipe:
+def degraded(share: float, body: Conduct, noise: float | None = None) -> Recipe:
     """The default sets: a share of the episodes is degraded, each bad behaviour in equal parts; errors as above."""
     if not 0.0 <= share <= 1.0:
         raise UserError(f"the degraded share must lie in [0, 1], got {share}")
     others = [name for name in BEHAVIOURS if name != "expert"]
-    return mixed({"expert": 1.0 - share, **dict.fromkeys(others, share / len(others))}, noise)
+    return mixed({"expert": 1.0 - share, **dict.fromkeys(others, share / len(others))}, body, noise)
 
 
-def named(name: str, noise: float | None = None) -> Recipe:
-    """OGBench's "navigate", "stitch" or "explore"; None takes its noise. Errors as ``mixed``."""
+def named(name: str, body: Conduct, noise: float | None = None) -> Recipe:
+    """OGBench's "navigate", "stitch" or "explore"; None takes the body's noise, of ``explore`` the heavy one.
+
+    Errors as ``mixed``.
+    """
+    to_goals = mixed({"expert": 1.0}, body, noise)
+    about = mixed({"wander": 1.0}, body, body.heavy_noise if noise is None else noise)
     recipes = {
-        "navigate": mixed({"expert": 1.0}, NOISE if noise is None else noise),
-        "stitch": replace(mixed({"expert": 1.0}, NOISE if noise is None else noise), episode_steps=200, goal_cells=4),
-        "explore": replace(
-            mixed({"wander": 1.0}, EXPLORE_NOISE if noise is None else noise), episode_steps=500, heading_steps=10
-        ),
+        "navigate": to_goals,
+        "stitch": replace(to_goals, episode_steps=body.stitch_steps, goal_cells=4),
+        "explore": replace(about, episode_steps=EXPLORE_STEPS, heading_seconds=1.0),
     }
     return replace(recipes[name], name=name)
 

@@ -41,7 +41,9 @@ _OVERRIDE = 1.5  # what is learned can turn the heading to anywhere
 _SPIN_SCALE = 0.25  # of the root
 _SWING_SCALE = 0.1  # of the joints
 _RISING_SPAN = 2.0  # rad
-_SHARPEST = 0.7  # rad
+
+SHARPEST = 0.7
+"""How far from where it faces a humanoid is commanded at most, rad: the sharper it turns, the more often it falls."""
 
 
 class Policy(Protocol):
@@ -102,26 +104,27 @@ class HumanoidWalker:
 
     Args:
         actor: what was trained.
+        sharpest: see ``humanoid_heading``.
     """
 
-    def __init__(self, actor: Actor) -> None:
-        self.actor, self.params = actor, actor.params
+    def __init__(self, actor: Actor, sharpest: float = SHARPEST) -> None:
+        self.actor, self.params, self.sharpest = actor, actor.params, sharpest
 
     def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
         """See ``Policy.act``."""
-        view = humanoid_view(qpos, qvel, humanoid_heading(qpos, direction))
+        view = humanoid_view(qpos, qvel, humanoid_heading(qpos, direction, self.sharpest))
         return humanoid_joints(qpos, self.actor.mode(view))
 
 
-def humanoid_heading(qpos: jax.Array, direction: jax.Array) -> jax.Array:
-    """The unit vector[..., 2] nearest to ``direction[..., 2]`` that is at most _SHARPEST from where the body faces.
+def humanoid_heading(qpos: jax.Array, direction: jax.Array, sharpest: float) -> jax.Array:
+    """The unit vector[..., 2] nearest to ``direction[..., 2]`` that is at most ``sharpest`` rad off where it faces.
 
     What lies behind is turned to in a curve: a body that has to change its course at once falls. The walker is trained
     without this (with it, it learns to walk at that angle and never to turn) and commanded with it.
     """
     facing = unit_vector(forward_axis(qpos)[..., :2])
     seen = turned(direction, facing)
-    angle = jnp.clip(jnp.arctan2(seen[..., 1], seen[..., 0]), -_SHARPEST, _SHARPEST)
+    angle = jnp.clip(jnp.arctan2(seen[..., 1], seen[..., 0]), -sharpest, sharpest)
     return turned_back(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), facing)
 
 
@@ -205,9 +208,9 @@ def ant_walker(path: Path | None = None) -> AntWalker:
     return AntWalker(read_actor(path or shipped("ant_walker")))
 
 
-def humanoid_walker(path: Path | None = None) -> HumanoidWalker:
+def humanoid_walker(path: Path | None = None, sharpest: float = SHARPEST) -> HumanoidWalker:
     """The walking humanoid, shipped or in ``path``; errors as ``read_actor``."""
-    return HumanoidWalker(read_actor(path or shipped("humanoid_walker")))
+    return HumanoidWalker(read_actor(path or shipped("humanoid_walker")), sharpest)
 
 
 def ant_dribbler(path: Path | None = None) -> Dribbler:

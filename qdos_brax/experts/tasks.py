@@ -17,6 +17,7 @@ from envs.locomotion import dropped_humanoid, dropped_poses
 from envs.physics.base import PipelineState
 from envs.physics.mujoco_engine import MujocoEngine
 from qdos_brax.experts import policies, symmetry
+from qdos_brax.experts.poses import STANDING, humanoid_is_up, standing_humanoid
 from qdos_brax.experts.views import ANT_NQ, ANT_NV, body_view, forward_axis, random_direction, turned, uprightness
 from qdos_brax.high_level.sac import Batch
 
@@ -61,6 +62,7 @@ class Task(Protocol):
         discount: per control step.
         life_steps: a life ends after so many.
         turn_every: mean steps between two draws of the direction.
+        shake: standard deviation of the noise on ``joints`` while it learns, against which it has to hold its own.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Task(Protocol):
     discount: float
     life_steps: int
     turn_every: int
+    shake: float
 
     def reset(self, key: jax.Array) -> Life:
         """A new life."""
@@ -97,7 +100,7 @@ class AntWalking:
 
     name = "ant_walker"
     observation_dim, action_dim = 29, 8
-    discount, life_steps, turn_every = 0.99, 10**9, 100
+    discount, life_steps, turn_every, shake = 0.99, 10**9, 100, 0.0
 
     def __init__(self) -> None:
         self.engine = MujocoEngine(models.ant_model(), threads=1)
@@ -139,7 +142,7 @@ class AntDribbling:
 
     name = "ant_dribbler"
     observation_dim, action_dim = 35, 10
-    discount, life_steps, turn_every = 0.98, 300, 80
+    discount, life_steps, turn_every, shake = 0.98, 300, 80, 0.0
 
     LOST = 5.0
     FASTEST = 0.15  # m per control step
@@ -207,10 +210,9 @@ class HumanoidWalking:
 
     name = "humanoid_walker"
     observation_dim, action_dim = 55, 21
-    discount, life_steps, turn_every = 0.99, 300, 400
+    discount, life_steps, turn_every, shake = 0.99, 300, 400, 0.2
 
     PACE = 1.2  # m/s
-    STANDING = 1.29  # m, height of the torso
 
     def __init__(self) -> None:
         self.engine = MujocoEngine(models.humanoid_model(), threads=1)
@@ -265,7 +267,7 @@ class HumanoidRising:
 
     name = "humanoid_riser"
     observation_dim, action_dim = 55, 21
-    discount, life_steps, turn_every = 0.99, 300, 10**9
+    discount, life_steps, turn_every, shake = 0.99, 300, 10**9, 0.0
 
     STANDING_SHARE = 0.25
     PUSH = 0.5  # standard deviation of the velocities at a start on its feet, m/s and rad/s
@@ -295,7 +297,7 @@ class HumanoidRising:
 
     def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
         """See the class."""
-        height = jnp.clip(after.qpos[2] / HumanoidWalking.STANDING, 0.0, 1.0)
+        height = jnp.clip(after.qpos[2] / STANDING, 0.0, 1.0)
         is_up = humanoid_is_up(after.qpos)
         calm = jnp.exp(-jnp.sum(after.qvel[:2] ** 2))
         reward = (
@@ -315,17 +317,6 @@ def _mirrored(batch: Batch) -> Batch:
         action=symmetry.mirrored_action(batch.action),
         next_observation=symmetry.mirrored_view(batch.next_observation),
     )
-
-
-def standing_humanoid(key: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(qpos[28], qvel[27]) of a humanoid on its feet at the origin, turned by ``yaw``, its joints shifted a little."""
-    root = jnp.stack([0.0, 0.0, HumanoidWalking.STANDING, jnp.cos(yaw / 2), 0.0, 0.0, jnp.sin(yaw / 2)])
-    return jnp.concatenate([root, jax.random.uniform(key, (21,), minval=-0.05, maxval=0.05)]), jnp.zeros(27)
-
-
-def humanoid_is_up(qpos: jax.Array) -> jax.Array:
-    """bool[...]: the torso is at least 0.9 m high and within 60 degrees of the vertical."""
-    return (qpos[..., 2] > 0.9) & (uprightness(qpos) > 0.5)
 
 
 TASKS: dict[str, Callable[[], Task]] = {

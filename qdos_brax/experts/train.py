@@ -138,8 +138,9 @@ class Trainer:
     ) -> tuple[Batch, Life, dict[str, jax.Array]]:
         """One control step of all lives: the rows it gives, the lives that follow, means of what was measured."""
         n = action.shape[0]
-        reset_key, turn_key, turn_to_key = jax.random.split(key, 3)
+        reset_key, turn_key, turn_to_key, shake_key = jax.random.split(key, 4)
         joints = jax.vmap(self.task.joints)(lives, action)
+        joints = jnp.clip(joints + self.task.shake * jax.random.normal(shake_key, joints.shape), -1.0, 1.0)
         after = jax.vmap(self.task.engine.step)(lives.pipeline, joints)
         verdict = jax.vmap(self.task.judge)(lives, joints, after)
         next_observation = jax.vmap(self.task.observe)(lives.replace(pipeline=after))

@@ -1,5 +1,6 @@
 """Collection on real physics with a stand-in expert: sizes, codes, true next states, one seed repeats, two differ."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import envs
-from qdos_brax.data import cache, collect, formats, recipes
+from qdos_brax.data import bodies, cache, collect, formats, recipes
 from qdos_brax.data.commands import add_parser
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
@@ -40,7 +41,7 @@ def expert(env: envs.TaskEnv) -> StandIn:
     return StandInDribbler() if env.spec.family == "antsoccer" else StandIn()
 
 
-DEFAULT = recipes.degraded(0.5, 0.2)
+DEFAULT = recipes.degraded(0.5, bodies.ANT)
 
 
 @pytest.fixture(scope="module", params=["antmaze-medium", "antsoccer-arena"])
@@ -119,6 +120,7 @@ def test_teleporters_work_while_collecting() -> None:
 def test_a_body_without_an_expert_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     env = envs.make("humanoidmaze", physics="mujoco")
     monkeypatch.setenv("QDOS_DATA", str(tmp_path))
+    monkeypatch.delitem(bodies.CONDUCTS, "humanoidmaze")
     refused = pytest.raises(UserError, match=r"no expert .* humanoidmaze.*--dataset FILE.*humanoidmaze-medium-navigate")
     with refused:
         collect.collect(env, 400, DEFAULT, seed=0)
@@ -129,7 +131,7 @@ def test_a_body_without_an_expert_is_refused(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_the_share_of_degraded_episodes_is_as_stated(share: float) -> None:
-    kinds = recipes.episode_kinds(recipes.degraded(share).mix, 100, seed=0)
+    kinds = recipes.episode_kinds(recipes.degraded(share, bodies.ANT).mix, 100, seed=0)
     assert (kinds != QUALITY["navigate"]).sum() == round(100 * share)
     counts = [int((kinds == code).sum()) for code in QUALITY.values() if code != QUALITY["navigate"]]
     assert max(counts) - min(counts) <= 1
@@ -175,10 +177,12 @@ def test_a_mix_is_exact_to_the_episode_and_comes_from_the_seed() -> None:
 )
 def test_a_mix_that_makes_no_sense_is_refused(text: str, line: str) -> None:
     with pytest.raises(UserError, match=line):
-        recipes.mixed(recipes.parse_mix(text))
+        recipes.mixed(recipes.parse_mix(text), bodies.ANT)
 
 
-@pytest.mark.parametrize("make", [lambda: recipes.degraded(1.5), lambda: recipes.named("explore", noise=-1.0)])
+@pytest.mark.parametrize(
+    "make", [lambda: recipes.degraded(1.5, bodies.ANT), lambda: recipes.named("explore", bodies.ANT, noise=-1.0)]
+)
 def test_a_recipe_out_of_range_is_refused(make: Any) -> None:
     with pytest.raises(UserError):
         make()
@@ -186,7 +190,7 @@ def test_a_recipe_out_of_range_is_refused(make: Any) -> None:
 
 def test_stitch_keeps_its_goal_and_explore_its_heading() -> None:
     env = envs.make("antsoccer-arena", physics="mujoco")
-    stitch = collect.Collector(env, expert(env), recipes.named("stitch"))
+    stitch = collect.Collector(env, expert(env), recipes.named("stitch", bodies.ANT))
     lanes = stitch._reset(jax.random.split(jax.random.key(0), 32))
     cargo = np.where(lanes.has_ball[:, None], lanes.pipeline.qpos[:, 15:17], lanes.pipeline.qpos[:, :2])
     steps = np.abs(env.layout.xy_to_ij(cargo) - env.layout.xy_to_ij(np.asarray(lanes.goal_xy))).sum(axis=1)
@@ -197,11 +201,11 @@ def test_stitch_keeps_its_goal_and_explore_its_heading() -> None:
     at_goal = lanes.replace(has_ball=jnp.zeros(32, bool), goal_xy=lanes.pipeline.qpos[:, :2])
     after = plan(at_goal, kinds, jax.random.split(jax.random.key(1), 32))
     np.testing.assert_array_equal(after.goal_xy, at_goal.goal_xy)
-    navigate = collect.Collector(env, expert(env), recipes.named("navigate"))
+    navigate = collect.Collector(env, expert(env), recipes.named("navigate", bodies.ANT))
     after = jax.jit(jax.vmap(navigate._plan))(at_goal, kinds, jax.random.split(jax.random.key(1), 32))
     assert after.arrivals.tolist() == [1] * 32 and not np.array_equal(after.goal_xy, at_goal.goal_xy)
 
-    explore = jax.jit(jax.vmap(collect.Collector(env, expert(env), recipes.named("explore"))._plan))
+    explore = jax.jit(jax.vmap(collect.Collector(env, expert(env), recipes.named("explore", bodies.ANT))._plan))
     keys = jax.random.split(jax.random.key(2), 32)
     for clock, changes in ((10, True), (11, False), (19, False), (20, True)):
         turned = explore(lanes.replace(clock=jnp.full(32, clock)), kinds + QUALITY["wander"], keys).heading
@@ -213,7 +217,7 @@ def test_the_default_set_is_collected_once(
 ) -> None:
     env = envs.make("antmaze-medium", physics="mujoco")
     monkeypatch.setenv("QDOS_DATA", str(tmp_path / "data"))
-    monkeypatch.setattr(collect.policies, "ant_walker", StandIn)
+    monkeypatch.setitem(bodies.CONDUCTS, "antmaze", replace(bodies.ANT, expert=StandIn))
     parameters: dict[str, Any] = {"transitions": 400, "degraded_share": 0.5, "noise": 0.2, "num_envs": 2}
     path = cache.default_dataset(env, seed=0, **parameters)
     assert path.parent == tmp_path / "data" and str(path) in capsys.readouterr().out
@@ -245,7 +249,7 @@ def test_commands_make_info_and_check(
         args = parser.parse_args(["data", *words])
         return args.run(args), capsys.readouterr().out
 
-    monkeypatch.setattr(collect.policies, "ant_walker", StandIn)
+    monkeypatch.setitem(bodies.CONDUCTS, "antmaze", replace(bodies.ANT, expert=StandIn))
     path = str(tmp_path / "set.hdf5")
     assert run("make", "antmaze-medium", "--out", path, "--transitions", "400", "--num-envs", "2") == (0, f"{path}\n")
     code, text = run("info", path)

@@ -14,7 +14,8 @@ import envs
 from qdos_brax.data import collect
 from qdos_brax.errors import UserError
 from qdos_brax.experts import policies
-from qdos_brax.experts.tasks import HumanoidWalking, humanoid_is_up
+from qdos_brax.experts.poses import humanoid_is_up
+from qdos_brax.experts.tasks import HumanoidWalking
 from qdos_brax.experts.views import body_view, random_direction, turned
 
 
@@ -64,7 +65,7 @@ def test_the_humanoid_turns_in_a_curve(off: float, taken: float) -> None:
     turn, lean = np.array([np.cos(1.0), 0, 0, np.sin(1.0)]), np.array([np.cos(0.2), 0, np.sin(0.2), 0])
     quat = [turn[0] * lean[0], -turn[3] * lean[2], turn[0] * lean[2], turn[3] * lean[0]]  # first the lean
     qpos = jnp.zeros(28).at[3:7].set(jnp.array(quat))
-    heading = policies.humanoid_heading(qpos, jnp.array([np.cos(yaw + off), np.sin(yaw + off)]))
+    heading = policies.humanoid_heading(qpos, jnp.array([np.cos(yaw + off), np.sin(yaw + off)]), 0.7)
     np.testing.assert_allclose(heading, [np.cos(yaw + taken), np.sin(yaw + taken)], atol=1e-5)
 
 
@@ -114,7 +115,6 @@ def test_the_dribbler_scores() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="after 1,152,000 steps of training: 0.956 m/s, and 0.172 fell")
 def test_the_humanoid_walks() -> None:
     """64 episodes of 1,000 steps from standing, each along a direction of its own, without noise."""
     task, walker, episodes = HumanoidWalking(), policies.humanoid_walker(), 64

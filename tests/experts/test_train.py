@@ -46,7 +46,7 @@ class Going:
 
     name = "point"
     observation_dim, action_dim = 2, 2
-    discount, life_steps, turn_every = 0.5, 20, 10
+    discount, life_steps, turn_every, shake = 0.5, 20, 10, 0.0
     engine = Point()
 
     def reset(self, key: jax.Array) -> Life:
