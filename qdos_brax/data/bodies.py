@@ -76,8 +76,8 @@ HUMANOID = Conduct(
     partial(policies.humanoid_walker, sharpest=SHARPEST),
     _on_its_feet,
     is_down=lambda qpos: ~humanoid_is_up(qpos),
-    noise=0.1,
-    heavy_noise=0.3,
+    noise=0.2,
+    heavy_noise=0.4,
     stitch_steps=400,
 )
 

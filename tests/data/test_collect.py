@@ -15,6 +15,7 @@ from qdos_brax.data.commands import add_parser
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
 from qdos_brax.experts import policies
+from qdos_brax.experts.poses import STANDING, humanoid_is_up
 
 ROWS = 650  # three episodes of 200 steps and one that is cut
 
@@ -115,6 +116,36 @@ def test_teleporters_work_while_collecting() -> None:
     np.testing.assert_array_equal(rows["next_observations"][first], rows["observations"][first + 1])
     assert (np.linalg.norm(rows["observations"][first + 1, :2] - rows["observations"][first, :2], axis=1) < 1).all()
     assert (np.linalg.norm(rows["observations"][first + 2, :2] - came_out, axis=1) < 1).all()
+
+
+class Limp(StandIn):
+    """Lets a humanoid fall, within a second or so."""
+
+    def act(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
+        return jnp.zeros(21)
+
+
+def test_a_humanoid_that_fell_begins_anew_on_its_feet() -> None:
+    env = envs.make("humanoidmaze-medium", physics="mujoco")
+    rows = collect.collect(env, 400, recipes.degraded(0.5, bodies.HUMANOID), seed=0, num_envs=2, policy=Limp())
+    fell = rows["infos/fell"]
+    assert fell.sum() >= 4
+    lane_ends = np.isin(np.arange(400), [199, 399])
+    np.testing.assert_array_equal(rows["timeouts"], fell | lane_ends)
+    assert not rows["terminals"].any()
+    assert np.asarray(humanoid_is_up(rows["infos/qpos"])).all()  # what lies is the state behind the last row
+
+    first = np.flatnonzero(fell[:-1]) + 1
+    np.testing.assert_allclose(rows["infos/qpos"][first, 2], STANDING)
+    inside = ~rows["timeouts"]
+    shifted = np.roll(rows["observations"], -1, axis=0)
+    np.testing.assert_array_equal(rows["next_observations"][inside], shifted[inside])
+    for end in np.flatnonzero(fell)[:3]:
+        state = env.engine.init(rows["infos/qpos"][end], rows["infos/qvel"][end])
+        after = env.engine.step(state, rows["actions"][end])
+        assert not humanoid_is_up(after.qpos)
+        np.testing.assert_allclose(rows["next_observations"][end], env.observe(after), atol=2e-2)
+        assert np.abs(rows["next_observations"][end] - shifted[end]).max() > 0.1
 
 
 def test_a_body_without_an_expert_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
