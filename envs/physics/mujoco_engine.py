@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 from mujoco.batch import Batch
 
-from envs.maze import WALL_HALF_SIZE, Maze
+from envs.maze import UNIT, WALL_HALF_SIZE, Maze
 from envs.physics.base import PipelineState, Sensors
 from envs.physics.walls import WALLS, cells_in_reach
 
@@ -71,6 +71,11 @@ class MujocoEngine:
         self._bodies = list(bodies)
         walls = [] if layout is None else [model.geom(f"wall_{k}").id for k in range(WALLS * len(self._bodies))]
         self._wall_geoms = np.asarray(walls, int)
+        if layout is not None:
+            self._quarters = _walls_by_quarter(layout)
+            centres = layout.index_to_xy(np.arange(layout.num_cells + 1))
+            height = np.where(np.arange(layout.num_cells + 1) < layout.num_cells, WALL_HALF_SIZE[2], _SUNK)
+            self._centres = np.concatenate([centres, height[:, None]], axis=1)
         self._threads = threads or len(os.sched_getaffinity(0))
         self._sensors = sensors
         self._nsensed = sensors.size if sensors else 0
@@ -168,15 +173,14 @@ class MujocoEngine:
             return
         qpos = batch.bind("qpos")
         points = np.nan_to_num(np.stack([qpos[:, place : place + 2] for place in self._bodies], axis=1))
-        cells, is_wall = cells_in_reach(self._layout, points)  # [n, bodies, 4, 2], [n, bodies, 4]
-        n, none = batch.nsim, self._layout.num_cells
-        index = np.where(is_wall, cells[..., 0] * self._layout.grid.shape[1] + cells[..., 1], none).reshape(n, -1)
+        last = np.asarray(self._quarters.shape[:2]) - 1
+        row, column = np.moveaxis(np.clip(_quarter(self._layout, points), 0, last).astype(int), -1, 0)
+        index = self._quarters[row, column].reshape(batch.nsim, -1)
         index.sort(axis=1)
-        index[:, 1:][index[:, 1:] == index[:, :-1]] = none
-        index.sort(axis=1)
-        height = np.where(index < none, WALL_HALF_SIZE[2], _SUNK)
-        centres = np.concatenate([self._layout.index_to_xy(index), height[..., None]], axis=-1)
-        batch.expand("geom_pos")[:, self._wall_geoms] = centres
+        if len(self._bodies) > 1:
+            index[:, 1:][index[:, 1:] == index[:, :-1]] = self._layout.num_cells
+            index.sort(axis=1)
+        batch.expand("geom_pos")[:, self._wall_geoms] = self._centres[index]
 
     def _read_sensors(self, batch: Batch) -> np.ndarray:
         """float32[n, k] of the states that ``batch`` has just made a forward pass of."""
@@ -194,6 +198,21 @@ class MujocoEngine:
                     batch.bind(name)
             self._batches[n] = batch
         return self._batches[n]
+
+
+def _quarter(layout: Maze, xy: np.ndarray) -> np.ndarray:
+    """Row and column[..., 2] of the quarter of a cell that holds ``xy[..., 2]``, not rounded to whole numbers' type."""
+    corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
+    return np.floor((xy - corner)[..., ::-1] * (2 / UNIT))
+
+
+def _walls_by_quarter(layout: Maze) -> np.ndarray:
+    """int[2 rows, 2 columns, WALLS], the cells that are walls in reach of each quarter; ``num_cells`` for none."""
+    rows, columns = layout.grid.shape
+    corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
+    quarters = np.stack(np.meshgrid(np.arange(2 * columns), np.arange(2 * rows)), axis=-1)
+    cells, is_wall = cells_in_reach(layout, corner + (quarters + 0.5) * (0.5 * UNIT))
+    return np.where(is_wall, cells[..., 0] * columns + cells[..., 1], layout.num_cells)
 
 
 def _with_changes(exact: np.ndarray, values: np.ndarray) -> np.ndarray:
