@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from qdos_brax.population import Population
 from qdos_brax.runs import parts
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import read_rows
+from tests.runs.program import free_port
 
 ROOT = Path(__file__).parents[1]
 SHARED = np.linspace(-1, 1, 64, dtype=np.float32).reshape(8, 8)
@@ -168,10 +168,7 @@ def test_two_processes_train_the_members_of_one_and_go_on_after_a_kill(tmp_path:
     flags = f"--env antmaze-medium --preset smoke --method bc --seed 0,1,2 {sizes} --members-per-program 1"
     flags += f" --dataset {dataset} --set run.checkpoint_seconds=0"
     assert launch(f"{flags} --out {tmp_path}/one").wait(280) == 0
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    meet = f"--distributed --coordinator localhost:{port} --processes 2 --process-id"
+    meet = f"--distributed --coordinator localhost:{free_port()} --processes 2 --process-id"
     second, first = (launch(f"{flags} --out {tmp_path}/two {meet} {index}") for index in (1, 0))
     part = tmp_path / "two" / "processes" / "0" / "metrics.csv"
     while not part.exists() or len(part.read_text().splitlines()) < 3:

@@ -72,7 +72,8 @@ class MujocoEngine:
         walls = [] if layout is None else [model.geom(f"wall_{k}").id for k in range(WALLS * len(self._bodies))]
         self._wall_geoms = np.asarray(walls, int)
         if layout is not None:
-            self._quarters = _walls_by_quarter(layout)
+            self._corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
+            self._quarters = _walls_by_quarter(layout, self._corner)
             centres = layout.index_to_xy(np.arange(layout.num_cells + 1))
             height = np.where(np.arange(layout.num_cells + 1) < layout.num_cells, WALL_HALF_SIZE[2], _SUNK)
             self._centres = np.concatenate([centres, height[:, None]], axis=1)
@@ -173,13 +174,13 @@ class MujocoEngine:
             return
         qpos = batch.bind("qpos")
         points = np.nan_to_num(np.stack([qpos[:, place : place + 2] for place in self._bodies], axis=1))
+        quarters = np.floor((points - self._corner)[..., ::-1] * (2 / UNIT))
         last = np.asarray(self._quarters.shape[:2]) - 1
-        row, column = np.moveaxis(np.clip(_quarter(self._layout, points), 0, last).astype(int), -1, 0)
+        row, column = np.moveaxis(np.clip(quarters, 0, last).astype(int), -1, 0)
         index = self._quarters[row, column].reshape(batch.nsim, -1)
         index.sort(axis=1)
-        if len(self._bodies) > 1:
-            index[:, 1:][index[:, 1:] == index[:, :-1]] = self._layout.num_cells
-            index.sort(axis=1)
+        index[:, 1:][index[:, 1:] == index[:, :-1]] = self._layout.num_cells
+        index.sort(axis=1)
         batch.expand("geom_pos")[:, self._wall_geoms] = self._centres[index]
 
     def _read_sensors(self, batch: Batch) -> np.ndarray:
@@ -200,16 +201,14 @@ class MujocoEngine:
         return self._batches[n]
 
 
-def _quarter(layout: Maze, xy: np.ndarray) -> np.ndarray:
-    """Row and column[..., 2] of the quarter of a cell that holds ``xy[..., 2]``, not rounded to whole numbers' type."""
-    corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
-    return np.floor((xy - corner)[..., ::-1] * (2 / UNIT))
+def _walls_by_quarter(layout: Maze, corner: np.ndarray) -> np.ndarray:
+    """int[2 rows, 2 columns, WALLS], cells that are walls in reach of each quarter of a cell; ``num_cells`` for none.
 
-
-def _walls_by_quarter(layout: Maze) -> np.ndarray:
-    """int[2 rows, 2 columns, WALLS], the cells that are walls in reach of each quarter; ``num_cells`` for none."""
+    Args:
+        layout: the maze.
+        corner: float[2], its own corner at the lowest x and y.
+    """
     rows, columns = layout.grid.shape
-    corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
     quarters = np.stack(np.meshgrid(np.arange(2 * columns), np.arange(2 * rows)), axis=-1)
     cells, is_wall = cells_in_reach(layout, corner + (quarters + 0.5) * (0.5 * UNIT))
     return np.where(is_wall, cells[..., 0] * columns + cells[..., 1], layout.num_cells)

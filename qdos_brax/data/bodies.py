@@ -1,4 +1,4 @@
-"""How each body is collected with: who moves it, how it starts, when it is down for good, how much noise it bears."""
+"""How each body is collected with: who moves it, how it starts, when it is down for good, what noise spoils it."""
 
 from __future__ import annotations
 
@@ -30,15 +30,14 @@ class Conduct:
         start: (task, direction[2] of the way ahead, key) to (qpos[nq], qvel[nv]), from which an episode begins
             elsewhere.
         is_down: bool of qpos[nq], it lies and no expert gets it up, which ends the episode; None: it never stays down.
-        noise: standard deviation of the action noise under which the expert still does its work.
-        heavy_noise: that of noisy episodes, and of ``explore``: spoils what the expert does.
+        heavy_noise: standard deviation of the action noise of noisy episodes, and of ``explore``: spoils what the
+            expert does.
         stitch_steps: control steps of an episode of ``stitch``.
     """
 
     expert: Callable[[], policies.Policy]
     start: Callable[[TaskEnv, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
     is_down: Callable[[jax.Array], jax.Array] | None
-    noise: float
     heavy_noise: float
     stitch_steps: int
 
@@ -70,13 +69,12 @@ def _on_its_feet(env: TaskEnv, ahead: jax.Array, key: jax.Array) -> tuple[jax.Ar
     return qpos, qvel + RESET_NOISE * jax.random.normal(qvel_key, qvel.shape)
 
 
-ANT = Conduct(policies.ant_walker, _as_the_task, is_down=None, noise=0.2, heavy_noise=1.0, stitch_steps=200)
+ANT = Conduct(policies.ant_walker, _as_the_task, is_down=None, heavy_noise=1.0, stitch_steps=200)
 
 HUMANOID = Conduct(
     partial(policies.humanoid_walker, sharpest=SHARPEST),
     _on_its_feet,
     is_down=lambda qpos: ~humanoid_is_up(qpos),
-    noise=0.2,
     heavy_noise=0.4,
     stitch_steps=400,
 )

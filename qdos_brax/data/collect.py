@@ -254,8 +254,8 @@ class Collector:
 
         def some(lanes: Lane) -> Lane:
             fresh = jax.vmap(self._reset_lane)(keys).replace(arrivals=lanes.arrivals)
-            chosen = lambda a, b: jnp.where(fell.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
-            return jax.tree.map(chosen, fresh, lanes)
+            choose = jax.vmap(jnp.where)  # by lane
+            return jax.tree.map(lambda new, old: choose(fell, new, old), fresh, lanes)
 
         return jax.lax.cond(fell.any(), some, lambda lanes: lanes, lanes)  # most steps see no fall
 

@@ -44,7 +44,10 @@ def add_parser(commands: Any) -> None:
         help="mixed: share of degraded episodes, in equal parts (default 0.5)",
     )
     make.add_argument(
-        "--noise", metavar="X", type=float, help="action noise of the other episodes (default 0.2, explore 1)"
+        "--noise",
+        metavar="X",
+        type=float,
+        help="action noise of the other episodes (default 0.2; explore: 1, humanoid 0.4)",
     )
     make.add_argument("--seed", metavar="S", type=int, default=0, help="seed (default 0)")
     make.add_argument("--num-envs", metavar="N", type=int, default=64, help="environments at once (default 64)")
@@ -91,11 +94,12 @@ def _recipe(args: argparse.Namespace, env: envs.TaskEnv) -> recipes.Recipe:
         if args.mix is not None or args.degraded_share is not None:
             raise UserError(f"--recipe {args.recipe} takes neither --mix nor --degraded-share; mixed does")
         return recipes.named(args.recipe, body, args.noise)
+    noise = recipes.NOISE if args.noise is None else args.noise
     if args.mix is None:
-        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, body, args.noise)
+        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, body, noise)
     if args.degraded_share is not None:
         raise UserError("--mix and --degraded-share both say what is mixed; give one of them")
-    return recipes.mixed(recipes.parse_mix(args.mix), body, args.noise)
+    return recipes.mixed(recipes.parse_mix(args.mix), body, noise)
 
 
 def _fetch(args: argparse.Namespace) -> int:

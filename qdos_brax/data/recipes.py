@@ -20,6 +20,7 @@ BEHAVIOURS = {"expert": QUALITY["navigate"], **{name: code for name, code in QUA
 
 NAMES = ("navigate", "stitch", "explore", "mixed")
 
+NOISE = 0.2  # standard deviation on actions, as OGBench's: the experts do their work under it
 EXPLORE_STEPS = 500  # of an episode of explore
 
 
@@ -46,8 +47,8 @@ class Recipe:
     heading_seconds: float | None = None
 
 
-def mixed(mix: Mapping[str, float], body: Conduct, noise: float | None = None) -> Recipe:
-    """A mixture of behaviours that go to goals anywhere; None takes the body's noise.
+def mixed(mix: Mapping[str, float], body: Conduct, noise: float = NOISE) -> Recipe:
+    """A mixture of behaviours that go to goals anywhere.
 
     Raises:
         UserError: shares are negative or do not sum to 1, a behaviour is unknown, or the noise is negative.
@@ -59,13 +60,12 @@ def mixed(mix: Mapping[str, float], body: Conduct, noise: float | None = None) -
             raise UserError(f"the share of {name} must lie in [0, 1], got {share}")
     if abs(sum(mix.values()) - 1.0) > 1e-6:
         raise UserError(f"the shares of a mix must sum to 1, these sum to {sum(mix.values()):g}: {mix_text(mix)}")
-    noise = body.noise if noise is None else noise
     if not noise >= 0.0:
         raise UserError(f"the action noise must be 0 or more, got {noise}")
     return Recipe("mixed", mix, noise, body.heavy_noise)
 
 
-def degraded(share: float, body: Conduct, noise: float | None = None) -> Recipe:
+def degraded(share: float, body: Conduct, noise: float = NOISE) -> Recipe:
     """The default sets: a share of the episodes is degraded, each bad behaviour in equal parts; errors as above."""
     if not 0.0 <= share <= 1.0:
         raise UserError(f"the degraded share must lie in [0, 1], got {share}")
@@ -74,11 +74,11 @@ def degraded(share: float, body: Conduct, noise: float | None = None) -> Recipe:
 
 
 def named(name: str, body: Conduct, noise: float | None = None) -> Recipe:
-    """OGBench's "navigate", "stitch" or "explore"; None takes the body's noise, of ``explore`` the heavy one.
+    """OGBench's "navigate", "stitch" or "explore"; None takes its noise, of ``explore`` the body's heavy one.
 
     Errors as ``mixed``.
     """
-    to_goals = mixed({"expert": 1.0}, body, noise)
+    to_goals = mixed({"expert": 1.0}, body, NOISE if noise is None else noise)
     about = mixed({"wander": 1.0}, body, body.heavy_noise if noise is None else noise)
     recipes = {
         "navigate": to_goals,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 from qdos_brax import config as configs
 from qdos_brax.runs.checkpoint import final_artifacts
 from qdos_brax.runs.folder import RunFolder
-from tests.runs.program import assert_same_run, launch
+from tests.runs.program import assert_same_run, free_port, launch
 
 # One member per program: in one of several the compiler is free to add up in another order, and members differ by
 # float32's rounding, which grows.
@@ -40,10 +39,7 @@ def test_members_are_the_same_however_they_are_run(tmp_path: Path) -> None:
     two_devices = launch(tmp_path / "data-devices", *flags, "--out", str(devices), JAX_NUM_CPU_DEVICES="2")
     assert two_devices.wait(900) == 0
     assert "over 2 devices" in (tmp_path / "data-devices" / "log").read_text()
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    meet = f"--distributed --coordinator localhost:{port} --processes 2 --process-id"
+    meet = f"--distributed --coordinator localhost:{free_port()} --processes 2 --process-id"
     together = [
         launch(tmp_path / f"data-{index}", *flags, "--out", str(hosts), *meet.split(), str(index)) for index in (0, 1)
     ]
