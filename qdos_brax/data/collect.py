@@ -30,7 +30,7 @@ from qdos_brax.experts import policies
 from qdos_brax.experts.steering import Navigator, approach, dribble_direction, maze_direction
 from qdos_brax.experts.views import random_direction
 
-RECIPE = 3
+RECIPE = 4
 """Version of what is collected; part of the cache's file names, as are the experts' weights."""
 
 WANDER_SECONDS = 3.0  # mean time between two draws of a wanderer's direction, where the recipe does not say
@@ -63,6 +63,27 @@ class Row(NamedTuple):
     action: Any
     next_observation: Any
     fell: Any
+
+
+class Draws(NamedTuple):
+    """What chance gives a lane for one step, wanted or not.
+
+    They are drawn for many steps at once: between two calls of the engine a draw is dozens of tiny operations.
+
+    Attributes:
+        goal_xy, away_xy: float32[2], centres of free cells.
+        turn: float32, uniform in [0, 1).
+        heading: float32[2], a unit vector.
+        noise: float32[nu], standard normal.
+        teleport: key of the teleporters.
+    """
+
+    goal_xy: jax.Array
+    away_xy: jax.Array
+    turn: jax.Array
+    heading: jax.Array
+    noise: jax.Array
+    teleport: jax.Array
 
 
 class Lane(struct.PyTreeNode):
@@ -236,28 +257,21 @@ class Collector:
 
     @partial(jax.jit, static_argnums=0)
     def _chunk(self, lanes: Lane, kinds: jax.Array, keys: jax.Array) -> tuple[Lane, Row]:
-        """CHUNK_STEPS steps of every lane; rows as [L, CHUNK_STEPS, ...]."""
+        """CHUNK_STEPS steps of every lane; rows as [L, CHUNK_STEPS, ...].
 
-        def step(lanes: Lane, keys: jax.Array) -> tuple[Lane, Row]:
-            uses = jax.vmap(lambda key: jax.random.split(key, 4))(keys)
-            lanes, row = jax.vmap(self._step_lane)(lanes, kinds, uses[:, :3])
-            return self._restart(lanes, row.fell, uses[:, 3]), row
+        A lane whose body falls goes on from a start that is drawn once a chunk: a call of the engine for every fall
+        would be felt. One that falls twice within a chunk, which takes a second, begins at the same place again.
+        """
+        split = jax.vmap(lambda key: jax.random.split(key, CHUNK_STEPS + 1), out_axes=1)(keys)
+        draws = jax.vmap(jax.vmap(self._draw))(split[:-1])
+        starts = None if self.body.is_down is None else jax.vmap(self._reset_lane)(split[-1])
 
-        by_step = jax.vmap(lambda key: jax.random.split(key, CHUNK_STEPS), out_axes=1)(keys)
-        lanes, rows = jax.lax.scan(step, lanes, by_step)
+        def step(lanes: Lane, draws: Draws) -> tuple[Lane, Row]:
+            lanes, row = jax.vmap(self._step_lane)(lanes, kinds, draws)
+            return _restarted(lanes, starts, row.fell), row
+
+        lanes, rows = jax.lax.scan(step, lanes, draws)
         return lanes, jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), rows)
-
-    def _restart(self, lanes: Lane, fell: jax.Array, keys: jax.Array) -> Lane:
-        """New episodes in the lanes that ``fell[L]``."""
-        if self.body.is_down is None:
-            return lanes
-
-        def some(lanes: Lane) -> Lane:
-            fresh = jax.vmap(self._reset_lane)(keys).replace(arrivals=lanes.arrivals)
-            choose = jax.vmap(jnp.where)  # by lane
-            return jax.tree.map(lambda new, old: choose(fell, new, old), fresh, lanes)
-
-        return jax.lax.cond(fell.any(), some, lambda lanes: lanes, lanes)  # most steps see no fall
 
     def _reset_lane(self, key: jax.Array) -> Lane:
         """Everything at random free cells, with the body's reset noise; the first goal is drawn."""
@@ -314,20 +328,32 @@ class Collector:
             return body, body
         return body, jnp.where(has_ball, qpos[BALL_QPOS : BALL_QPOS + 2], body)
 
-    def _step_lane(self, lane: Lane, kind: jax.Array, keys: jax.Array) -> tuple[Lane, Row]:
-        """A control step, with ``keys[3]`` for plans, noise and teleporters."""
-        plan_key, noise_key, teleport_key = keys
-        lane = self._plan(lane, kind, plan_key)
+    def _draw(self, key: jax.Array) -> Draws:
+        """All that a step of one lane may need."""
+        plan_key, noise_key, teleport_key = jax.random.split(key, 3)
+        goal_key, away_key, turn_key, heading_key = jax.random.split(plan_key, 4)
+        return Draws(
+            goal_xy=self.navigator.random_free_xy(goal_key),
+            away_xy=self.navigator.random_free_xy(away_key),
+            turn=jax.random.uniform(turn_key),
+            heading=random_direction(heading_key),
+            noise=jax.random.normal(noise_key, (self.env.engine.nu,)),
+            teleport=teleport_key,
+        )
+
+    def _step_lane(self, lane: Lane, kind: jax.Array, draws: Draws) -> tuple[Lane, Row]:
+        """A control step."""
+        lane = self._plan(lane, kind, draws)
         qpos, qvel = lane.pipeline.qpos, lane.pipeline.qvel
         action = self._action(lane, kind)
         sigma = jnp.where(kind == QUALITY["noisy"], self.recipe.heavy_noise, self.recipe.noise)
-        action = jnp.clip(action + sigma * jax.random.normal(noise_key, action.shape), -1.0, 1.0)
+        action = jnp.clip(action + sigma * draws.noise, -1.0, 1.0)
         pipeline = self.env.engine.step(lane.pipeline, action)
         after = self.env.observe(pipeline)
         fell = jnp.zeros((), bool) if self.body.is_down is None else self.body.is_down(pipeline.qpos)
         row = Row(qpos, qvel, lane.observation, action, after, fell)
         lane = lane.replace(
-            pipeline=self.env.teleport(pipeline, teleport_key),
+            pipeline=self.env.teleport(pipeline, draws.teleport),
             observation=after,  # still at the entrance, as the task's own step shows it
             attempt=lane.attempt + 1,
             clock=lane.clock + 1,
@@ -335,9 +361,8 @@ class Collector:
         )
         return lane, row
 
-    def _plan(self, lane: Lane, kind: jax.Array, key: jax.Array) -> Lane:
-        """Turns a failing attempt, draws a new goal on arrival or when stuck, sends a stuck body elsewhere."""
-        goal_key, away_key, turn_key, heading_key = jax.random.split(key, 4)
+    def _plan(self, lane: Lane, kind: jax.Array, draws: Draws) -> Lane:
+        """Turns a failing attempt, takes a new goal on arrival or when stuck, sends a stuck body elsewhere."""
         body, cargo = self._positions(lane.pipeline.qpos, lane.has_ball)
         gap = jnp.linalg.norm(cargo - lane.goal_xy)
         half_way = gap < 0.5 * jnp.linalg.norm(lane.origin_xy - lane.goal_xy)
@@ -350,16 +375,16 @@ class Collector:
         arrived = ~lane.turned & (gap < GOAL_TOLERANCE)
         redraw = undone | stuck | arrived if self.recipe.goal_cells is None else jnp.zeros((), bool)
         if self.heading_steps is None:
-            heads_anew = jax.random.uniform(turn_key) < 1 / self.wander_steps
+            heads_anew = draws.turn < 1 / self.wander_steps
         else:
             heads_anew = lane.clock % self.heading_steps == 0
         return lane.replace(
-            goal_xy=jnp.where(redraw, self._goal_xy(goal_key, cargo), lane.goal_xy),
+            goal_xy=jnp.where(redraw, draws.goal_xy, lane.goal_xy),
             origin_xy=jnp.where(redraw, cargo, lane.origin_xy),
             turned=jnp.where(redraw, False, lane.turned | turns),
             attempt=jnp.where(redraw | turns, 0, lane.attempt),
-            heading=jnp.where(heads_anew, random_direction(heading_key), lane.heading),
-            away_xy=jnp.where(stuck, self.navigator.random_free_xy(away_key), lane.away_xy),
+            heading=jnp.where(heads_anew, draws.heading, lane.heading),
+            away_xy=jnp.where(stuck, draws.away_xy, lane.away_xy),
             escape=jnp.where(stuck, self.escape_steps, lane.escape),
             arrivals=lane.arrivals + (arrived & redraw),
             seen_body=jnp.where(checks, body, lane.seen_body),
@@ -394,6 +419,15 @@ class Collector:
         dribbles = lane.has_ball & near & (lane.escape == 0) & (kind != QUALITY["wander"])
         push = dribble_direction(self.navigator, cargo, target)
         return jnp.where(dribbles, self.dribbler.act(qpos, qvel, push), action)
+
+
+def _restarted(lanes: Lane, starts: Lane | None, fell: jax.Array) -> Lane:
+    """``lanes``, but where ``fell[L]`` the new episodes that ``starts`` holds; without starts none falls."""
+    if starts is None:
+        return lanes
+    starts = starts.replace(arrivals=lanes.arrivals)
+    choose = jax.vmap(jnp.where)  # by lane
+    return jax.tree.map(lambda new, old: choose(fell, new, old), starts, lanes)
 
 
 def _episode_length(transitions: int, num_envs: int, cap: int) -> int:
