@@ -228,18 +228,20 @@ def test_stitch_keeps_its_goal_and_explore_its_heading() -> None:
     assert (steps == 4).all()  # an open field: cells to go are those of rows and columns
     assert 4 < int(lanes.has_ball.sum()) < 28
     kinds = jnp.zeros(32, jnp.int8)
+    draw = jax.vmap(stitch._draw)  # the same of every recipe
     plan = jax.jit(jax.vmap(stitch._plan))
     at_goal = lanes.replace(has_ball=jnp.zeros(32, bool), goal_xy=lanes.pipeline.qpos[:, :2])
-    after = plan(at_goal, kinds, jax.random.split(jax.random.key(1), 32))
+    draws = draw(jax.random.split(jax.random.key(1), 32))
+    after = plan(at_goal, kinds, draws)
     np.testing.assert_array_equal(after.goal_xy, at_goal.goal_xy)
     navigate = collect.Collector(env, expert(env), recipes.named("navigate", bodies.ANT))
-    after = jax.jit(jax.vmap(navigate._plan))(at_goal, kinds, jax.random.split(jax.random.key(1), 32))
+    after = jax.jit(jax.vmap(navigate._plan))(at_goal, kinds, draws)
     assert after.arrivals.tolist() == [1] * 32 and not np.array_equal(after.goal_xy, at_goal.goal_xy)
 
     explore = jax.jit(jax.vmap(collect.Collector(env, expert(env), recipes.named("explore", bodies.ANT))._plan))
-    keys = jax.random.split(jax.random.key(2), 32)
+    draws = draw(jax.random.split(jax.random.key(2), 32))
     for clock, changes in ((10, True), (11, False), (19, False), (20, True)):
-        turned = explore(lanes.replace(clock=jnp.full(32, clock)), kinds + QUALITY["wander"], keys).heading
+        turned = explore(lanes.replace(clock=jnp.full(32, clock)), kinds + QUALITY["wander"], draws).heading
         assert bool((turned != lanes.heading).any(axis=1).all()) == changes == bool((turned != lanes.heading).any())
 
 
