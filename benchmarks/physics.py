@@ -5,6 +5,7 @@ nothing compiled to the first step done, and peak memory, of
 
     stock-mjx     OGBench's own model, all walls, on MJX as it comes (without observation, reward or reset)
     mjx           our environment on MJX, reset included
+    mjx-warp      our environment on MuJoCo Warp, reset included (CUDA alone; only where --kinds names it)
     mujoco        our environment on MuJoCo C, inside jit, reset included
     bare          OGBench's model, all walls, in a plain pool of threads (without observation, reward or reset)
     gymnasium     OGBench's environment, one of them
@@ -33,7 +34,7 @@ import numpy as np
 
 TASKS = ("antmaze-medium", "antmaze-large", "antmaze-giant", "antsoccer-arena", "humanoidmaze-medium")
 BATCHES = (1, 16, 64, 256)
-KINDS = ("stock-mjx", "mjx", "mujoco", "bare", "gymnasium", "async")
+KINDS = ("stock-mjx", "mjx", "mjx-warp", "mujoco", "bare", "gymnasium", "async")
 FRAME_SKIP = 5
 CORES = len(os.sched_getaffinity(0))
 
@@ -166,8 +167,8 @@ def ogbench_env(task: str) -> Any:
 
 def make_cell(kind: str, task: str, batch: int) -> Callable[[], int]:
     """The function whose calls are timed; it returns how many environment steps it made."""
-    if kind in ("mjx", "mujoco"):
-        return ours(task, batch, kind, control_steps=5 if kind == "mjx" else 50)
+    if kind in ("mjx", "mjx-warp", "mujoco"):
+        return ours(task, batch, kind, control_steps=50 if kind == "mujoco" else 5)
     if kind == "stock-mjx":
         return stock_mjx(task, batch)
     if kind == "bare":
@@ -186,7 +187,8 @@ def measure(kind: str, task: str, batch: int, seconds: float) -> dict[str, Any]:
         made += steps()
     rate = made / (time.perf_counter() - began)
     memory = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return {"steps_per_second": round(rate, 1), "first_step_seconds": round(first, 1), "peak_mib": memory // 1024}
+    numbers = {"steps_per_second": round(rate, 1), "first_step_seconds": round(first, 1), "peak_mib": memory // 1024}
+    return numbers | ({"device": sys.modules["jax"].devices()[0].device_kind} if "jax" in sys.modules else {})
 
 
 # --- All cells ---------------------------------------------------------------------------------------------------
@@ -250,7 +252,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS))
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=[kind for kind in KINDS if kind != "mjx-warp"])
     parser.add_argument("--batches", nargs="+", type=int, default=list(BATCHES))
     parser.add_argument("--seconds", type=float, default=5.0, help="length of a measurement (default 5)")
     parser.add_argument(

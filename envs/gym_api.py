@@ -66,7 +66,7 @@ class TaskGymEnv(_Backed, gymnasium.Env):
 
     Args:
         task: a name that ``envs.make`` knows.
-        physics: "mjx", "mjx-warp", "mujoco", or "auto": MuJoCo C where jax has only a CPU, MJX on an accelerator.
+        physics: "mjx", "mjx-warp", "mujoco", or "auto" (MuJoCo C).
         render_mode: None or "rgb_array".
         **frames: height, width and camera of frames, as ``envs.render.Renderer`` takes them.
 

@@ -54,8 +54,7 @@ def make(name: str, physics: str = "auto") -> TaskEnv:
 
     Args:
         name: as "antmaze-large", "antmaze-large-task2" or an alias.
-        physics: "mjx", "mjx-warp", "mujoco", or "auto": MuJoCo C where jax has only a CPU, MJX on an accelerator
-            for the tasks that run on it.
+        physics: "mjx", "mjx-warp", "mujoco", or "auto" (MuJoCo C, for the tasks that run on it).
 
     Raises:
         ValueError: unknown task or engine, or one that the task or this machine does not run on; the message names the

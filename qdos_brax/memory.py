@@ -111,7 +111,7 @@ def plan(need: Estimate, members: int, devices: Sequence[jax.Device], room: int,
     words.append(f"about {_size(need.shared)} of data and {_size(each)} per member, of {_size(room)}")
     if parked:
         words.append("states wait in host memory")
-    elif together > room:
+    if (need.shared + per_program * each if parked else together) > room:
         words.append("which may be too little")
     return Plan(per_program, parked, ", ".join(words))
 

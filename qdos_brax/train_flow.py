@@ -256,7 +256,7 @@ def _announce(config: Config, asked: Config, chosen: bool) -> None:
     devices = jax.devices()
     why = f" (jax sees {'no accelerator' if config.preset == 'cpu' else 'an accelerator'}; --preset says otherwise)"
     alias = "" if asked.env == config.env else f" (asked for as {asked.env})"
-    engine = f"{config.physics}" + (" (chosen by hardware)" if asked.physics == "auto" else "")
+    engine = f"{config.physics}" + (" (auto)" if asked.physics == "auto" else "")
     print(f"task      {config.env}{alias}")
     print(f"method    {config.method}, alpha {_list(config.skills.alpha)}, seed {_list(config.seed)}")
     print(f"preset    {config.preset}{why if chosen else ''}")

@@ -16,7 +16,10 @@ ENGINES = ("mjx", "mjx-warp", "mujoco")
 
 
 def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
-    """The engine's name; "auto" takes MuJoCo C where jax has only a CPU, MJX on an accelerator.
+    """The engine's name; "auto" takes MuJoCo C, beside an accelerator too.
+
+    With 64 environments 16 cores make 15 times the steps of MJX on an H200; MJX passes them near 2,000 environments,
+    more than a run here steps at a time (results/physics-gpu.json).
 
     Args:
         physics: what the user asked for.
@@ -27,8 +30,7 @@ def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
             to install or to choose.
     """
     if physics == "auto":
-        best = "mujoco" if jax.default_backend() == "cpu" else "mjx"
-        return best if best in supported else supported[0]
+        return "mujoco" if "mujoco" in supported else supported[0]
     if physics not in ENGINES:
         raise ValueError(f"there is no physics engine {physics!r}; choose auto, {_either(ENGINES)}")
     if physics not in supported:

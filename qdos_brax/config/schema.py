@@ -355,7 +355,7 @@ class Config:
         method: the name of a recipe in ``qdos_brax.methods``.
         preset: the sizes that were laid over the task's values: "paper", "cpu" or "smoke".
         seed: seeds; several make a scan.
-        physics: engine: "auto" (MuJoCo C on a CPU, MJX on an accelerator), "mjx", "mjx-warp" (CUDA) or "mujoco".
+        physics: engine: "auto" (MuJoCo C), "mjx", "mjx-warp" (CUDA) or "mujoco".
         members_per_program: members that one device trains at once; 0 lets the program choose before it starts, by
             what is faster on a CPU and by what fits an accelerator. It decides the order of sums, hence last digits.
         dataset: a data file, or None to collect the task's default set.

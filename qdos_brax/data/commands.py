@@ -52,7 +52,7 @@ def add_parser(commands: Any) -> None:
     make.add_argument("--seed", metavar="S", type=int, default=0, help="seed (default 0)")
     make.add_argument("--num-envs", metavar="N", type=int, default=64, help="environments at once (default 64)")
     make.add_argument(
-        "--physics", metavar="ENGINE", default="auto", help="auto, mjx, mjx-warp or mujoco (default auto: by hardware)"
+        "--physics", metavar="ENGINE", default="auto", help="auto, mjx, mjx-warp or mujoco (default auto: mujoco)"
     )
     make.set_defaults(run=_make)
 
