@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -338,3 +340,15 @@ def _guarded(work: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
+    except Exception as error:
+        if not _is_opengls(error):
+            raise
+        asked = os.environ.get("MUJOCO_GL")
+        print(f"error: MUJOCO_GL is {asked!r}, which MuJoCo cannot load here ({error}); unset it", file=sys.stderr)
+        return 2
+
+
+def _is_opengls(error: Exception) -> bool:
+    """Whether ``import mujoco`` failed at the OpenGL library that MUJOCO_GL names; nothing but pictures needs one."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return "MUJOCO_GL" in os.environ and any(Path(frame.filename).name == "gl_context.py" for frame in frames)

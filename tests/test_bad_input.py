@@ -186,3 +186,12 @@ def test_so_does_the_real_program(command: str, places: dict[str, Path]) -> None
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, *arguments], cwd=ROOT, env=env, capture_output=True, text=True, timeout=300)
     assert done.returncode == 2 and done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1, done
+
+
+def test_so_does_an_opengl_that_mujoco_cannot_load(tmp_path: Path) -> None:
+    """It fails inside ``import mujoco``, so in a process of its own."""
+    arguments = [sys.executable, "train.py", *shlex.split(START), "--out", str(tmp_path / "run")]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": "nonsense"}
+    done = subprocess.run(arguments, cwd=ROOT, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done
+    assert "MUJOCO_GL is 'nonsense'" in done.stderr and done.stderr.endswith("unset it\n"), done
