@@ -18,7 +18,7 @@ ENGINES = ("mjx", "mjx-warp", "mujoco")
 def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
     """The engine's name; "auto" takes MuJoCo C, beside an accelerator too.
 
-    With 64 environments 16 cores make 15 times the steps of MJX on an H200; MJX passes them near 2,000 environments,
+    With 64 environments 16 cores make 15 times the steps of MJX on an H200; MJX passes them near 2,000 (interpolated),
     more than a run here steps at a time (results/physics-gpu.json).
 
     Args:
