@@ -100,7 +100,8 @@ def plan(need: Estimate, members: int, devices: Sequence[jax.Device], room: int,
     most = -(-members // len(devices))
     fitting = max(1, int((_ROOM * room - need.shared) // each))
     per_program = min(wanted or fitting, most)
-    together = need.shared + members * need.kept + per_program * each
+    at_once = need.shared + per_program * each
+    together = at_once + members * need.kept
     parked = devices[0].platform != "cpu" and per_program < most and together > _ROOM * room
     slots = per_program * min(len(devices), -(-members // per_program))
     turns = -(-members // slots)
@@ -111,7 +112,7 @@ def plan(need: Estimate, members: int, devices: Sequence[jax.Device], room: int,
     words.append(f"about {_size(need.shared)} of data and {_size(each)} per member, of {_size(room)}")
     if parked:
         words.append("states wait in host memory")
-    if (need.shared + per_program * each if parked else together) > room:
+    if (at_once if parked else together) > room:
         words.append("which may be too little")
     return Plan(per_program, parked, ", ".join(words))
 

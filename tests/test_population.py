@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -140,6 +141,10 @@ def test_a_plan_fits_and_says_so() -> None:
     assert tight.per_program == 4 and "in 3 turns" in tight.line
     assert memory.plan(need, 9, cpu, 10_000, 2).per_program == 2
     assert "too little" in memory.plan(need, 9, cpu, 120, 0).line
+    accelerator = [SimpleNamespace(platform="gpu")]  # the others' states can wait elsewhere, the group's own cannot
+    waits, cramped = (memory.plan(need, 9, accelerator, room, 0) for room in (250, 120))  # type: ignore[arg-type]
+    assert waits.parked and waits.per_program == 4 and "too little" not in waits.line
+    assert cramped.parked and cramped.per_program == 1 and "too little" in cramped.line
 
 
 def test_shares_are_blocks_and_cover_everyone() -> None:
