@@ -1,9 +1,9 @@
-"""How many members a device trains at once: an estimate of their memory before anything runs, and a choice.
+"""How many members train at once, and where: an estimate of their memory before anything runs, and a choice.
 
-As many go together as fit, on a CPU too. Measured there (two cores with other jobs beside, antmaze-medium, MuJoCo C, 3
-members of preset cpu and 9 of preset smoke): the online phase of members in one program takes about half the time of
-members in turn, since its batches of simulations are larger and its many small steps are made once for all; skills took
-about the same. Nine members of preset cpu were not measured.
+On an accelerator as many as fit share a program. On a CPU each has a core (a device) to itself, and those beyond take
+turns. Measured on two idle cores (antmaze-medium, preset cpu, MuJoCo C, 4 members): each makes 470 environment steps a
+second with a core to itself, 365 with all in one program, 330 in turns on both cores; skills train equally fast. And a
+member's numbers do not depend on its company then (see ``Population``).
 """
 
 from __future__ import annotations
@@ -57,11 +57,13 @@ class Plan:
     """How the members run.
 
     Attributes:
+        devices: that they are spread over.
         per_program: members that one device trains at once.
         parked: whether their states wait in host memory.
         line: the estimate and the choice, in words.
     """
 
+    devices: tuple[jax.Device, ...]
     per_program: int
     parked: bool
     line: str
@@ -97,24 +99,31 @@ def plan(need: Estimate, members: int, devices: Sequence[jax.Device], room: int,
         wanted: members per program that the user or the run's first process chose; 0 for none.
     """
     each = need.kept + need.working
-    most = -(-members // len(devices))
-    fitting = max(1, int((_ROOM * room - need.shared) // each))
-    per_program = min(wanted or fitting, most)
-    at_once = need.shared + per_program * each
-    together = at_once + members * need.kept
-    parked = devices[0].platform != "cpu" and per_program < most and together > _ROOM * room
-    slots = per_program * min(len(devices), -(-members // per_program))
-    turns = -(-members // slots)
+    states = members * need.kept
+    if devices[0].platform == "cpu":  # the cores have one memory, in which every state lies
+        per_program = min(wanted or 1, members)
+        group = need.shared + per_program * need.working
+        fitting = max(1, int((_ROOM * room - states) // group))
+        used = min(len(devices), -(-members // per_program), fitting)
+        parked, at_once = False, states + used * group
+    else:
+        fitting = max(1, int((_ROOM * room - need.shared) // each))
+        per_program = min(wanted or fitting, -(-members // len(devices)))
+        used = min(len(devices), -(-members // per_program))
+        group = need.shared + per_program * each
+        parked = used * per_program < members and group + states > _ROOM * room
+        at_once = group if parked else group + states
+    turns = -(-members // (used * per_program))
     words = [f"{members} members"]
-    words.append("all in one program" if turns == 1 and slots > 1 else f"{slots} at a time, in {turns} turns")
-    if len(devices) > 1:
-        words.append(f"over {min(len(devices), members)} devices")
+    words.append("all in one program" if turns == 1 else f"{used * per_program} at a time, in {turns} turns")
+    if used > 1:
+        words.append(f"over {used} devices")
     words.append(f"about {_size(need.shared)} of data and {_size(each)} per member, of {_size(room)}")
     if parked:
         words.append("states wait in host memory")
-    if (at_once if parked else together) > room:
+    if at_once > room:
         words.append("which may be too little")
-    return Plan(per_program, parked, ", ".join(words))
+    return Plan(tuple(devices[:used]), per_program, parked, ", ".join(words))
 
 
 def room_of(device: jax.Device) -> int:

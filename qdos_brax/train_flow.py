@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -37,7 +38,17 @@ def prepare_jax() -> None:
     # MuJoCo C is called back from compiled programs; with asynchronous dispatch on a CPU such a callback can wait for
     # ever on arrays that wait for it (jax issue 25861). Long programs lose nothing by it; accelerators ignore it.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+    _make_cores_devices()
     compile_cache.enable()
+
+
+def _make_cores_devices() -> None:
+    """Every core a device of its own, unless the user has said how many: members are spread over them."""
+    said = "JAX_NUM_CPU_DEVICES" in os.environ
+    if said or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
+        return
+    with contextlib.suppress(RuntimeError):  # jax is in use already, as in a notebook: its devices stay as they are
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
 
 
 def start(
@@ -194,7 +205,7 @@ def _train(config: Config, folder: RunFolder, members: list[dict[str, Any]], sta
         config = configs.replace(config, members_per_program=found.per_program)
         write_text(folder.config, configs.to_yaml(config))
     hyper = configs.population_hyper(config, members)
-    population = Population(hyper, found.per_program, jax.local_devices(), found.parked)
+    population = Population(hyper, found.per_program, found.devices, found.parked)
     return run_phases(
         build_phases(config, env, dataset, population),
         folder,

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import pytest
 
 from qdos_brax import cli, memory, train_flow
@@ -49,7 +50,9 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(train_flow, "_default_data", lambda config, env: data)
     monkeypatch.setattr(train_flow.formats, "read", lambda path, env: None)
     monkeypatch.setattr(train_flow, "build_phases", phases)
-    monkeypatch.setattr(train_flow, "plan_members", lambda *args: memory.Plan(1, False, "toys"))
+    monkeypatch.setattr(
+        train_flow, "plan_members", lambda *args: memory.Plan((jax.local_devices()[0],), 1, False, "toys")
+    )
     monkeypatch.setattr(inside, "look_inside", lambda path: None)  # toys have nothing inside
     monkeypatch.setattr(train_flow.jax, "clear_caches", lambda: None)  # the other tests' programs are theirs
     return built

@@ -134,16 +134,26 @@ def test_memory_is_near_what_the_compiler_says() -> None:
     assert 0.3 < needed / compiled.temp_size_in_bytes < 4
 
 
-def test_a_plan_fits_and_says_so() -> None:
-    need, cpu = memory.Estimate(shared=100, kept=10, working=20), jax.local_devices()[:1]
-    assert memory.plan(need, 9, cpu, 10_000, 0).per_program == 9
-    tight = memory.plan(need, 9, cpu, 250, 0)  # 225 bytes may be used: the data and four members
-    assert tight.per_program == 4 and "in 3 turns" in tight.line
-    assert memory.plan(need, 9, cpu, 10_000, 2).per_program == 2
-    assert "too little" in memory.plan(need, 9, cpu, 120, 0).line
-    accelerator = [SimpleNamespace(platform="gpu")]  # the others' states can wait elsewhere, the group's own cannot
-    waits, cramped = (memory.plan(need, 9, accelerator, room, 0) for room in (250, 120))  # type: ignore[arg-type]
-    assert waits.parked and waits.per_program == 4 and "too little" not in waits.line
+def test_a_plan_gives_every_member_a_core_and_fits() -> None:
+    need, cores = memory.Estimate(shared=100, kept=10, working=20), [SimpleNamespace(platform="cpu")] * 4
+    plan = memory.plan(need, 9, cores, 10_000, 0)  # type: ignore[arg-type]
+    assert (len(plan.devices), plan.per_program) == (4, 1) and "4 at a time, in 3 turns, over 4 devices" in plan.line
+    assert len(memory.plan(need, 3, cores, 10_000, 0).devices) == 3  # type: ignore[arg-type]
+    tight = memory.plan(need, 9, cores, 400, 0)  # type: ignore[arg-type]  # 360 may be used: states 90, 120 per core
+    assert len(tight.devices) == 2 and "too little" not in tight.line
+    assert "too little" in memory.plan(need, 9, cores, 200, 0).line  # type: ignore[arg-type]
+    together = memory.plan(need, 9, cores, 10_000, 5)  # type: ignore[arg-type]
+    assert (len(together.devices), together.per_program) == (2, 5) and "all in one program" in together.line
+
+
+def test_a_plan_fills_an_accelerator() -> None:
+    need, one = memory.Estimate(shared=100, kept=10, working=20), [SimpleNamespace(platform="gpu")]
+    assert memory.plan(need, 9, one, 10_000, 0).per_program == 9  # type: ignore[arg-type]
+    assert memory.plan(need, 9, one, 10_000, 2).per_program == 2  # type: ignore[arg-type]
+    assert memory.plan(need, 9, one * 3, 10_000, 0).per_program == 3  # type: ignore[arg-type]
+    # Of 250 bytes 225 may be used, by the data and four members. The others' states can wait elsewhere, a group's not.
+    waits, cramped = (memory.plan(need, 9, one, room, 0) for room in (250, 120))  # type: ignore[arg-type]
+    assert waits.parked and waits.per_program == 4 and "in 3 turns" in waits.line and "too little" not in waits.line
     assert cramped.parked and cramped.per_program == 1 and "too little" in cramped.line
 
 

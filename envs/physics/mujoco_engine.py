@@ -8,8 +8,9 @@ loop of ``mujoco.mj_step`` bit for bit, and the callback stays a pure function o
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import jax
 import jax.numpy as jnp
@@ -82,8 +83,7 @@ class MujocoEngine:
         self._nsensed = sensors.size if sensors else 0
         self._nstate = mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
         self._rest = _integration_state(model)
-        self._batches: dict[int, Batch] = {}
-        self._lock = threading.Lock()  # a Batch must not be used from two threads at once
+        self._idle: dict[int, list[Batch]] = defaultdict(list)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
         """The state at (qpos[nq], qvel[nv]) without warm start, as after ``mj_resetData`` and ``set_state``."""
@@ -133,8 +133,7 @@ class MujocoEngine:
         starts = np.asarray(fresh).reshape(n)
         rows = np.ascontiguousarray(np.asarray(bits).reshape(n, -1)).view(np.float64)
         stage = mujoco.mjtStage.mjSTAGE_NONE if self._sensors is None else mujoco.mjtStage.mjSTAGE_VEL
-        with self._lock:
-            batch = self._batch(n)
+        with self._batch(n) as batch:
             np.copyto(batch.state, rows)
             batch.state[starts] = self._rest
             for name, given in (("qpos", qpos), ("qvel", qvel)):
@@ -156,8 +155,7 @@ class MujocoEngine:
         """The callback of ``init``: what is sensed at rest rows with (qpos, qvel)."""
         lead = np.shape(qpos)[:-1]
         n = int(np.prod(lead, dtype=int))
-        with self._lock:
-            batch = self._batch(n)
+        with self._batch(n) as batch:
             batch.state[:] = self._rest
             batch.bind("qpos")[:] = np.asarray(qpos).reshape(n, -1)
             batch.bind("qvel")[:] = np.asarray(qvel).reshape(n, -1)
@@ -191,14 +189,18 @@ class MujocoEngine:
         xmat = xmat.reshape(*xpos.shape, 3)
         return self._sensors.read(self.model, xpos, xmat, sensordata).astype(np.float32)
 
-    def _batch(self, n: int) -> Batch:
-        if n not in self._batches:
+    @contextmanager
+    def _batch(self, n: int) -> Iterator[Batch]:
+        """A batch of n that no other thread uses: programs on several devices call the engine at once."""
+        try:
+            batch = self._idle[n].pop()
+        except IndexError:
             batch = Batch(self.model, nsim=n, nthread=min(self._threads, n))
             if self._sensors is not None:
                 for name in _SENSED_FIELDS:  # a field is filled from the first call after it was bound
                     batch.bind(name)
-            self._batches[n] = batch
-        return self._batches[n]
+        yield batch
+        self._idle[n].append(batch)
 
 
 def _walls_by_quarter(layout: Maze, corner: np.ndarray) -> np.ndarray:

@@ -97,7 +97,7 @@ def plan_members(config: Config, env: Any, dataset: Dataset, members: Sequence[M
         UserError: the data cannot serve this configuration.
     """
     if len(members) == 1:
-        return memory.Plan(1, False, "1 member")
+        return memory.Plan((jax.local_devices()[0],), 1, False, "1 member")
     one = Population(configs.population_hyper(config, members[:1]))
     shared = sum(value.nbytes for value in vars(dataset).values() if isinstance(value, np.ndarray))
     need = memory.estimate(build_phases(config, env, dataset, one), shared)
