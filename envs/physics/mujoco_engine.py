@@ -20,6 +20,7 @@ from flax import struct
 from mujoco.batch import Batch
 
 from envs.maze import UNIT, WALL_HALF_SIZE, Maze
+from envs.physics import timers
 from envs.physics.base import PipelineState, Sensors
 from envs.physics.walls import WALLS, cells_in_reach
 
@@ -65,6 +66,7 @@ class MujocoEngine:
         threads: int | None = None,
         sensors: Sensors | None = None,
     ) -> None:
+        timers.stop()
         self.model = model
         self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
         self.frame_skip = frame_skip
