@@ -53,28 +53,24 @@ def near_walls_ant(mocap: bool, ball: bool = False) -> mujoco.MjModel:
     """The ant on an open floor, with the walls that can be in reach: ``WALLS`` boxes per free body, to be moved there.
 
     Args:
-        mocap: the boxes are mocap bodies ("ant_wall_0", .., "ball_wall_0", ..), for MJX; else geoms of the world
-            ("wall_0", ..), for MuJoCo C. See ``_compile_for_mjx`` and ``_compile_for_c``.
+        mocap: the boxes are mocap bodies ("ant_wall_0", .., "ball_wall_0", ..), for MJX; else geoms of the world of
+            these names, for MuJoCo C. See ``_compile_for_mjx`` and ``_compile_for_c``.
         ball: with the soccer ball.
     """
     root = ET.parse(_ANT).getroot()
     world = _find(root, "worldbody")
-    if not mocap:
-        _add_world_walls(world, bodies=1 + ball)
-        if ball:
-            _add_ball(world)
-        return _compile_for_c(root)
-
+    add_walls = _add_mocap_walls if mocap else _add_world_walls
     for geom in _find(world, "body[@name='torso']").iter("geom"):
         geom.set("contype", str(_BODY_BIT | _KICK_BIT))
         geom.set("conaffinity", "0")
-    _add_mocap_walls(world, "ant", _BODY_BIT)
+    add_walls(world, "ant", _BODY_BIT)
     if ball:
+        add_walls(world, "ball", _BALL_BIT)
         geom = _add_ball(world)
         geom.set("contype", str(_BALL_BIT))
         geom.set("conaffinity", str(_KICK_BIT))
-        _add_mocap_walls(world, "ball", _BALL_BIT)
-    return _compile_for_mjx(root, floor_bits=_BODY_BIT | _BALL_BIT)
+    floor_bits = _BODY_BIT | _BALL_BIT
+    return _compile_for_mjx(root, floor_bits) if mocap else _compile_for_c(root, floor_bits)
 
 
 def near_walls_humanoid(mocap: bool) -> mujoco.MjModel:
@@ -82,19 +78,22 @@ def near_walls_humanoid(mocap: bool) -> mujoco.MjModel:
     root = ET.parse(_HUMANOID).getroot()
     world = _find(root, "worldbody")
     if not mocap:
-        _add_world_walls(world, bodies=1)
-        return _compile_for_c(root)
+        _add_world_walls(world, "humanoid", _BODY_BIT)
+        return _compile_for_c(root, floor_bits=_BODY_BIT)
     _add_mocap_walls(world, "humanoid", _BODY_BIT)
     return _compile_for_mjx(root, floor_bits=_BODY_BIT)
 
 
-def _compile_for_c(root: ET.Element) -> mujoco.MjModel:
-    """What can touch is listed beforehand; see ``envs.models.pairs``.
+def _compile_for_c(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
+    """What can touch is listed beforehand (see ``envs.models.pairs``); cameras and lights go, nobody sees through them.
 
     MuJoCo's own reset of states that blow up is off: whoever steps the model shall see them. So are islands where all
     joints hang together: there is only one, and looking for it costs time and changes nothing.
     """
+    _find(_find(root, "worldbody"), "geom[@name='floor']").set("conaffinity", str(floor_bits))
     spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    for element in (*spec.cameras, *spec.lights):
+        spec.delete(element)
     list_pairs(spec)
     model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -111,10 +110,11 @@ def _compile_for_mjx(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 
-def _add_world_walls(world: ET.Element, bodies: int) -> None:
+def _add_world_walls(world: ET.Element, owner: str, bit: int) -> None:
     """Boxes of the world, as a whole maze has them, so that contacts are found in the same order and bit for bit."""
-    for k in range(WALLS * bodies):
-        _add_box(world, {"name": f"wall_{k}", "pos": "0 0 -100", "contype": "1", "conaffinity": "1"})
+    for k in range(WALLS):
+        box = {"name": f"{owner}_wall_{k}", "pos": "0 0 -100", "contype": "0", "conaffinity": str(bit)}
+        _add_box(world, box)
 
 
 def _add_mocap_walls(world: ET.Element, owner: str, bit: int) -> None:

@@ -22,7 +22,7 @@ from mujoco.batch import Batch
 from envs.maze import UNIT, WALL_HALF_SIZE, Maze
 from envs.physics import timers
 from envs.physics.base import PipelineState, Sensors
-from envs.physics.walls import WALLS, cells_in_reach
+from envs.physics.walls import cells_in_reach
 
 _SUNK = -100.0  # height of a box that stands for no wall
 _SENSED_FIELDS = ("xpos", "xmat", "sensordata")
@@ -45,8 +45,9 @@ class MujocoEngine:
 
     Args:
         model: the compiled model; no activation states and no plugins (the ant and humanoid tasks have none). With a
-            layout, it has ``WALLS`` boxes per body, geoms of the world called "wall_0", .., and its pairs of geoms are
-            listed (``envs.models.pairs``), since MuJoCo's search would not see that boxes move.
+            layout, it has ``WALLS`` boxes for each body in turn, geoms of the world called "ant_wall_0", .., which this
+            body alone can touch, and its pairs of geoms are listed (``envs.models.pairs``), since MuJoCo's search would
+            not see that boxes move.
         layout: the maze; its walls in reach are put in place before each control step, which is bit for bit the same
             as with all of them, and costs less. None leaves the model as it is.
         bodies: where in qpos the x of each free body lies.
@@ -72,8 +73,7 @@ class MujocoEngine:
         self.frame_skip = frame_skip
         self._layout = layout
         self._bodies = list(bodies)
-        walls = [] if layout is None else [model.geom(f"wall_{k}").id for k in range(WALLS * len(self._bodies))]
-        self._wall_geoms = np.asarray(walls, int)
+        self._wall_geoms = np.asarray([k for k in range(model.ngeom) if "_wall_" in model.geom(k).name], int)
         if layout is not None:
             self._corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
             self._quarters = _walls_by_quarter(layout, self._corner)
@@ -165,11 +165,7 @@ class MujocoEngine:
             return self._read_sensors(batch).reshape(*lead, self._nsensed)
 
     def _place_walls(self, batch: Batch) -> None:
-        """Moves the boxes to the walls around each body.
-
-        They come in the order of the whole maze, in which contacts are solved, and which so decides the last bit. A
-        wall near two bodies has one box; boxes without a wall stay out of reach.
-        """
+        """Moves each body's boxes to the walls around it; those without a wall stay out of reach."""
         if self._layout is None:
             return
         qpos = batch.bind("qpos")
@@ -178,9 +174,6 @@ class MujocoEngine:
         last = np.asarray(self._quarters.shape[:2]) - 1
         row, column = np.moveaxis(np.clip(quarters, 0, last).astype(int), -1, 0)
         index = self._quarters[row, column].reshape(batch.nsim, -1)
-        index.sort(axis=1)
-        index[:, 1:][index[:, 1:] == index[:, :-1]] = self._layout.num_cells
-        index.sort(axis=1)
         batch.expand("geom_pos")[:, self._wall_geoms] = self._centres[index]
 
     def _read_sensors(self, batch: Batch) -> np.ndarray:
@@ -208,6 +201,8 @@ class MujocoEngine:
 def _walls_by_quarter(layout: Maze, corner: np.ndarray) -> np.ndarray:
     """int[2 rows, 2 columns, WALLS], cells that are walls in reach of each quarter of a cell; ``num_cells`` for none.
 
+    They are in the order of the whole maze, in which contacts are solved, and which so decides the last bit.
+
     Args:
         layout: the maze.
         corner: float[2], its own corner at the lowest x and y.
@@ -215,7 +210,7 @@ def _walls_by_quarter(layout: Maze, corner: np.ndarray) -> np.ndarray:
     rows, columns = layout.grid.shape
     quarters = np.stack(np.meshgrid(np.arange(2 * columns), np.arange(2 * rows)), axis=-1)
     cells, is_wall = cells_in_reach(layout, corner + (quarters + 0.5) * (0.5 * UNIT))
-    return np.where(is_wall, cells[..., 0] * columns + cells[..., 1], layout.num_cells)
+    return np.sort(np.where(is_wall, cells[..., 0] * columns + cells[..., 1], layout.num_cells), axis=-1)
 
 
 def _with_changes(exact: np.ndarray, values: np.ndarray) -> np.ndarray:
