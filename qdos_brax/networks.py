@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from qdos_brax.gru import BidirectionalGRU
+from qdos_brax.layer_norm import LayerNormReLU
 
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 
@@ -30,11 +31,9 @@ class MLP(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Maps [..., in] to [..., features[-1]]."""
-        for width in self.features[:-1]:
+        for layer, width in enumerate(self.features[:-1]):
             x = nn.Dense(width)(x)
-            if self.layer_norm:
-                x = nn.LayerNorm()(x)
-            x = nn.relu(x)
+            x = LayerNormReLU(name=f"LayerNorm_{layer}")(x) if self.layer_norm else nn.relu(x)
         return nn.Dense(self.features[-1])(x)
 
 

@@ -1,11 +1,13 @@
 """Densities against independent formulas, and the ensemble."""
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
 from qdos_brax import networks
+from qdos_brax.layer_norm import layer_norm_relu
 
 
 def test_gaussian_log_prob_is_scipys():
@@ -44,3 +46,28 @@ def test_ensemble_members_differ_and_do_not_mix():
     assert not np.allclose(outputs[0], outputs[1])
     changed = jax.tree.map(lambda p: p.at[0].set(0.0), params)
     np.testing.assert_array_equal(ensemble.apply(changed, x)[1:], outputs[1:])
+
+
+def test_layer_norm_and_relu_are_flax_s_and_so_are_their_gradients():
+    width, keys = 48, jax.random.split(jax.random.key(0), 4)
+    x = 3.0 + 2.0 * jax.random.normal(keys[0], (5, 7, width))
+    scale, bias, into = (
+        jax.random.normal(key, shape) for key, shape in zip(keys[1:], ((width,), (width,), x.shape), strict=True)
+    )
+
+    def plain(x, scale, bias):
+        return nn.relu(nn.LayerNorm().apply({"params": {"scale": scale, "bias": bias}}, x))
+
+    np.testing.assert_allclose(layer_norm_relu(x, scale, bias), plain(x, scale, bias), rtol=1e-5, atol=1e-5)
+    gradients = [
+        jax.grad(lambda *args, f=f: jnp.sum(into * f(*args)), (0, 1, 2))(x, scale, bias)
+        for f in (layer_norm_relu, plain)
+    ]
+    for found, expected in zip(*gradients, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_layer_norm_s_parameters_are_named_as_flax_s():
+    params = networks.MLP((6, 1), layer_norm=True).init(jax.random.key(0), jnp.zeros((1, 3)))["params"]
+    assert jax.tree.map(np.shape, params["LayerNorm_0"]) == {"scale": (6,), "bias": (6,)}
+    np.testing.assert_array_equal(params["LayerNorm_0"]["scale"], 1.0)
