@@ -82,7 +82,7 @@ def train_parser() -> Parser:
     parser.add_argument(
         "--physics",
         metavar="ENGINE",
-        help="auto, mjx, mjx-warp or mujoco (default auto: MuJoCo C where there is only a CPU, MJX on an accelerator)",
+        help="auto, mjx, mjx-warp or mujoco (default auto: MuJoCo C where the task has it)",
     )
     parser.add_argument("--steps", metavar="N", help="environment steps of the online phase")
     parser.add_argument(

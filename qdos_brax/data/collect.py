@@ -30,7 +30,7 @@ from qdos_brax.experts import policies
 from qdos_brax.experts.steering import Navigator, approach, dribble_direction, maze_direction
 from qdos_brax.experts.views import random_direction
 
-RECIPE = 4
+RECIPE = 5
 """Version of what is collected; part of the cache's file names, as are the experts' weights."""
 
 WANDER_SECONDS = 3.0  # mean time between two draws of a wanderer's direction, where the recipe does not say

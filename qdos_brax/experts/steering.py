@@ -14,6 +14,9 @@ from envs.maze import UNIT, Maze
 from qdos_brax.vectors import unit_vector
 
 _CORRIDOR = 1.2  # m to either side of a straight line that must be free: the reach of the ant's legs
+_BERTH = 3.0  # m from a wall within which a ball is led away from it
+_LEAD = 1.5  # how much at the wall itself, next to 1 towards the goal
+_SIDES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])  # x, y
 
 
 class Navigator:
@@ -27,6 +30,7 @@ class Navigator:
         self.maze = maze
         self.next_cell = jnp.asarray(maze.next_step_table)  # int32[C, C], the neighbour to enter, from row to column
         self.sight_cell = jnp.asarray(_farthest_in_sight(maze))  # int32[C, C], the last cell a straight walk reaches
+        self._wall_beside = jnp.asarray(_walls_beside(maze))  # bool[C, 4], on each of _SIDES
         self._cell_steps = jnp.asarray(maze.steps_table)  # int32[C, C], cells to go, -1 without a path
         indices = maze.cell_index(maze.ij_to_xy(maze.free_cells))
         leads_on = (maze.next_step_table[indices] != indices[:, None]).any(axis=1)  # not walled in on all sides
@@ -50,6 +54,13 @@ class Navigator:
         drawn = jax.random.categorical(key, jnp.where(fits, 0.0, -jnp.inf))
         return self.centre(jnp.where(fits.any(), drawn, cell))
 
+    def off_walls(self, xy: jax.Array) -> jax.Array:
+        """Vector[2] away from the walls that adjoin the cell of ``xy`` within the berth; 1 at a wall, falling to 0."""
+        cell = self.cell(xy)
+        gap = UNIT / 2 - jnp.asarray(_SIDES) @ (xy - self.centre(cell))
+        nearness = jnp.where(self._wall_beside[cell], jnp.clip(1 - gap / _BERTH, 0.0, 1.0), 0.0)
+        return -nearness @ jnp.asarray(_SIDES, jnp.float32)
+
 
 def maze_direction(maze: Navigator, xy: jax.Array, goal_xy: jax.Array) -> jax.Array:
     """Unit vector[2] from ``xy`` towards the centre of the next cell on a shortest path, or the goal in its cell."""
@@ -58,11 +69,14 @@ def maze_direction(maze: Navigator, xy: jax.Array, goal_xy: jax.Array) -> jax.Ar
 
 
 def dribble_direction(maze: Navigator, ball_xy: jax.Array, goal_xy: jax.Array) -> jax.Array:
-    """Unit vector[2] along which a ball at ``ball_xy`` goes straight to the farthest point of its path in sight."""
+    """Unit vector[2] along which a ball at ``ball_xy`` goes to the farthest point of its path in sight.
+
+    Straight in the open. Along a wall in an arc: a ball at the wall leaves the ant no room to get behind it.
+    """
     ball, goal = maze.cell(ball_xy), maze.cell(goal_xy)
     waypoint = maze.sight_cell[ball, goal]
     target = jnp.where((ball == goal) | (waypoint == goal), goal_xy, maze.centre(waypoint))
-    return unit_vector(target - ball_xy)
+    return unit_vector(unit_vector(target - ball_xy) + _LEAD * maze.off_walls(ball_xy))
 
 
 def approach(maze: Navigator, xy: jax.Array, target_xy: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -87,6 +101,14 @@ def _farthest_in_sight(maze: Maze) -> np.ndarray:
                 farthest = cell
             table[start, goal] = farthest
     return table
+
+
+def _walls_beside(maze: Maze) -> np.ndarray:
+    """bool[C, 4]: whether the neighbour of a free cell on each of _SIDES is a wall."""
+    beside = np.zeros((maze.num_cells, len(_SIDES)), bool)
+    for i, j in maze.free_cells:
+        beside[maze.cell_index(maze.ij_to_xy(np.array([i, j])))] = [maze.grid[i + dy, j + dx] for dx, dy in _SIDES]
+    return beside
 
 
 def _is_free_corridor(maze: Maze, start: int, goal: int) -> bool:

@@ -72,6 +72,27 @@ def test_a_ball_that_follows_gets_there_without_touching_walls(medium: Navigator
     assert not medium.maze.grid[ij[:, 0], ij[:, 1]].any()
 
 
+def test_a_ball_is_led_away_from_walls(arena: Navigator) -> None:
+    # Cell (1, 1) is centred at the origin, its walls at x = -2 and y = -2; the berth is 3 m.
+    np.testing.assert_allclose(arena.off_walls(jnp.zeros(2)), [1 / 3, 1 / 3], atol=1e-6)
+    np.testing.assert_allclose(arena.off_walls(jnp.array([-1.5, 0.0])), [5 / 6, 1 / 3], atol=1e-6)
+    np.testing.assert_allclose(arena.off_walls(jnp.array([0.0, 20.0])), [1 / 3, -1 / 3], atol=1e-6)
+    np.testing.assert_allclose(arena.off_walls(jnp.array([1.5, 9.0])), [0.0, 0.0], atol=1e-6)
+    along = dribble_direction(arena, jnp.array([0.0, 8.0]), jnp.array([0.0, 20.0]))
+    np.testing.assert_allclose(along, np.array([0.5, 1.0]) / np.sqrt(1.25), atol=1e-6)
+
+
+def test_a_ball_from_corner_to_corner_goes_in_an_arc(arena: Navigator) -> None:
+    def roll(xy: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        xy = xy + 0.1 * dribble_direction(arena, xy, jnp.array([0.0, 20.0]))
+        return xy, xy
+
+    _, path = jax.lax.scan(roll, jnp.array([-1.0, -1.0]), None, 300)
+    gap = np.asarray(path)[:, 0] + 2.0
+    assert gap[50:150].min() > 2.5  # m from the wall on its way
+    assert jnp.linalg.norm(path - jnp.array([0.0, 20.0]), axis=1).min() < 0.5
+
+
 def test_the_way_to_the_ball(medium: Navigator, arena: Navigator) -> None:
     direction, in_sight = approach(arena, jnp.array([4.0, 4.0]), jnp.array([8.0, 7.0]))
     assert in_sight

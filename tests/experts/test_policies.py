@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import envs
-from qdos_brax.data import collect
+from qdos_brax.data import bodies, collect
+from qdos_brax.data.quality import QUALITY
+from qdos_brax.data.recipes import named
 from qdos_brax.errors import UserError
 from qdos_brax.experts import policies
 from qdos_brax.experts.poses import humanoid_is_up
@@ -112,6 +114,30 @@ def test_shipped_weights_are_small_and_say_where_they_come_from(name: str) -> No
 def test_the_dribbler_scores() -> None:
     env = envs.make("antsoccer-arena", physics="mujoco")
     assert collect.goals_per_1000(env, policies.ant_dribbler(), noise=0.2, seed=0) >= 5.0
+
+
+class HeldGoal(collect.Collector):
+    """Collects the task itself: from its start, always to its goal."""
+
+    def _draw(self, key: jax.Array) -> collect.Draws:
+        return super()._draw(key)._replace(goal_xy=jnp.asarray(self.env.goal_xy, jnp.float32))
+
+    def _reset_lane(self, key: jax.Array) -> collect.Lane:
+        pipeline = self.env.reset(key).pipeline_state
+        goal, (body, ball) = jnp.asarray(self.env.goal_xy, jnp.float32), (pipeline.qpos[:2], pipeline.qpos[15:17])
+        lane = super()._reset_lane(key).replace(pipeline=pipeline, observation=self.env.observe(pipeline))
+        return lane.replace(goal_xy=goal, origin_xy=ball, away_xy=body, seen_body=body, seen_cargo=ball)
+
+
+@pytest.mark.slow
+def test_the_dribbler_gets_the_ball_out_of_a_corner_and_along_a_wall() -> None:
+    env, noise = envs.make("antsoccer-arena-task4", physics="mujoco"), 0.2
+    collector = HeldGoal(env, policies.ant_dribbler(), named("navigate", bodies.conduct_of(env), noise))
+    kinds = np.full(32, QUALITY["navigate"], np.int8)
+    qpos = collector.run(jax.random.key(0), kinds, 1000)[0]["infos/qpos"].reshape(32, 1000, -1)
+    scored = np.asarray(env.success(qpos, env.goal_xy)).astype(bool)
+    assert scored.any(axis=1).mean() >= 0.9
+    assert np.median(scored.argmax(axis=1)[scored.any(axis=1)]) <= 500
 
 
 @pytest.mark.slow
