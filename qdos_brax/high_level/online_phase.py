@@ -201,7 +201,9 @@ class OnlinePhase:
     ) -> tuple[OnlinePhaseState, dict[str, jax.Array]]:
         iteration = partial(self._iteration, frozen=frozen, hyper=hyper, data=data)
         state, info = jax.lax.scan(iteration, state, None, length=self._iterations)
-        return state.replace(chunk=state.chunk + 1), jax.tree.map(jnp.mean, info)
+        played = {name: jnp.sum(info.pop(name)) for name in ("reached", "ended")}
+        success = {"train/success": played["reached"] / played["ended"]}  # of the episodes; nan where none ended
+        return state.replace(chunk=state.chunk + 1), jax.tree.map(jnp.mean, info) | success
 
     def _iteration(
         self, state: OnlinePhaseState, _: None, frozen: Any, hyper: dict[str, jax.Array], data: DeviceData
@@ -248,8 +250,8 @@ class OnlinePhase:
         keys = jax.random.split(reset_key, num_envs)
         env_steps = state.env_steps + jnp.sum(result.steps)
         reached = jnp.any(result.success > 0) & (state.first_goal_step == NEVER)
+        over = (env_state.done > 0.5) | ~result.finite
         if self._guide is not None:
-            over = (env_state.done > 0.5) | ~result.finite
             fresh = self._guide.draw(_guide_key(reset_key), num_envs)
             state = state.replace(guided=jnp.where(over, fresh, jnp.maximum(state.guided - 1, 0)))
         state = state.replace(
@@ -259,7 +261,7 @@ class OnlinePhase:
             first_goal_step=jnp.where(reached, env_steps, state.first_goal_step),
             broken=state.broken + jnp.sum(~result.finite).astype(jnp.int32),
         )
-        return state, {"train/success": jnp.mean(result.success)}
+        return state, {"reached": jnp.sum(result.success), "ended": jnp.sum(over)}
 
     def _learn(
         self,

@@ -107,6 +107,16 @@ def test_first_goal_and_counts_are_kept(trained):
     assert bool(state.healthy[0]) and int(state.broken[0]) == 0
 
 
+def test_success_in_training_is_the_share_of_the_episodes_that_ended(trained):
+    _, _, history, _ = trained
+    shares = np.array([float(m["train/success"][0]) for m in history])
+    ended = shares[~np.isnan(shares)]
+    assert len(ended) and (0 <= ended).all() and (ended <= 1).all()
+    # The trained actor is sampled here and its mode evaluated, so nearly as good; per macro step the share would be
+    # a small fraction.
+    assert np.mean(ended[-5:]) >= 0.7, ended
+
+
 def test_a_phase_is_traced_once(trained):
     phase, _, _, _ = trained
     assert phase._chunk._cache_size() == 1
