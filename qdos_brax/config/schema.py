@@ -161,6 +161,7 @@ class HighLevelConfig:
         learning_rate: Adam's, of actor, critics and temperature.
         discount: per macro step.
         target_rate: Polyak rate of the target critics.
+        value_scale: the Q that an output of 1 of a critic's network stands for.
         init_temperature: first value of the entropy temperature.
         regulariser: what the temperature weighs: the actor's entropy ("entropy", SAC), or its divergence from the
             skill prior ("prior", in the bootstrap value too; SPiRL, Pertsch et al. 2020).
@@ -183,6 +184,7 @@ class HighLevelConfig:
     learning_rate: Scannable = rate(3e-4)
     discount: Scannable = number(0.99, high=1.0)
     target_rate: Scannable = number(0.005, high=1.0, above=True)
+    value_scale: float = number(1.0, above=True, scan=False)
     init_temperature: Scannable = number(0.05, above=True)
     regulariser: str = choice("entropy", "entropy", "prior")
     target_entropy_scale: Scannable = number(0.5)

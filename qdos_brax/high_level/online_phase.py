@@ -375,7 +375,15 @@ def high_level_sac(config: Config, observation_dim: int, source: SkillSource) ->
     """The high level's learner. SPiRL (Pertsch et al. 2020) has its regulariser in the bootstrap value too."""
     high = config.high_level
     regularised = high.regulariser == "prior"
-    return SAC(observation_dim, source.width, high.hidden, high.ensemble, high.target_subset, regularised)
+    return SAC(
+        observation_dim,
+        source.width,
+        high.hidden,
+        high.ensemble,
+        high.target_subset,
+        entropy_backup=regularised,
+        value_scale=high.value_scale,
+    )
 
 
 def _guide_key(key: jax.Array) -> jax.Array:

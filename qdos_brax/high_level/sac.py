@@ -79,6 +79,8 @@ class SAC:
         ensemble: number of critics, with LayerNorm.
         target_subset: random critics of the target ensemble whose minimum is the bootstrap value.
         entropy_backup: subtract the entropy term from the bootstrap value (SAC does, RLPD's mazes do not).
+        value_scale: the Q that an output of 1 of a critic's network stands for. Adam moves weights at a speed of its
+            own, so that networks whose outputs must reach hundreds take long to get there.
     """
 
     def __init__(
@@ -89,9 +91,11 @@ class SAC:
         ensemble: int,
         target_subset: int,
         entropy_backup: bool = False,
+        value_scale: float = 1.0,
     ) -> None:
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.ensemble, self.target_subset, self.entropy_backup = ensemble, target_subset, entropy_backup
+        self.value_scale = value_scale
         self.actor = DiagonalGaussian(tuple(hidden), action_dim)
         self.critic = Ensemble(tuple(hidden), ensemble)
         self._target_heads = Ensemble(tuple(hidden), target_subset)
@@ -123,7 +127,7 @@ class SAC:
 
     def values(self, critic: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
         """Q of every critic, [ensemble, ...]."""
-        return self.critic.apply(critic, jnp.concatenate([observation, action], axis=-1))
+        return self.value_scale * self.critic.apply(critic, jnp.concatenate([observation, action], axis=-1))
 
     def target_value(
         self, state: SACState, key: jax.Array, next_observation: jax.Array, reference: Reference | None = None
@@ -136,7 +140,8 @@ class SAC:
         action, log_prob = self._sample(state.actor, action_key, next_observation, reference)
         heads = jax.random.choice(subset_key, self.ensemble, (self.target_subset,), replace=False)
         chosen = jax.tree.map(lambda p: p[heads], state.target_critic)
-        value = self._target_heads.apply(chosen, jnp.concatenate([next_observation, action], axis=-1)).min(axis=0)
+        values = self._target_heads.apply(chosen, jnp.concatenate([next_observation, action], axis=-1))
+        value = self.value_scale * values.min(axis=0)
         if self.entropy_backup:
             value = value - jnp.exp(state.log_temperature) * log_prob
         return value

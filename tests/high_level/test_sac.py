@@ -95,6 +95,39 @@ def test_adam_step_is_the_published_first_step():
     np.testing.assert_allclose(new, [0.9, 2.1], rtol=1e-5)
 
 
+def test_a_value_scale_is_the_same_learner_in_other_units(sac):
+    """Rewards times 20 at scale 20: the networks' targets, and so Adam's steps, are those of rewards at scale 1."""
+    scaled = SAC(3, 2, (8, 8), ensemble=4, target_subset=2, value_scale=20.0)
+    state, batch, key = sac.init(jax.random.key(0), 0.1), make_batch(jax.random.key(1)), jax.random.key(2)
+    plain_values = sac.values(state.critic, batch.observation, batch.action)
+    scaled_values = scaled.values(state.critic, batch.observation, batch.action)
+    np.testing.assert_allclose(scaled_values, 20.0 * plain_values, rtol=1e-6)
+    plain, plain_info = sac.update_critic(state, batch, key, HYPER)
+    other, scaled_info = scaled.update_critic(state, batch._replace(reward=20.0 * batch.reward), key, HYPER)
+    np.testing.assert_allclose(scaled_info["q"], 20.0 * plain_info["q"], rtol=1e-5)
+    for expected, found in zip(jax.tree.leaves(plain.critic), jax.tree.leaves(other.critic), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_with_a_value_scale_critics_reach_large_values_sooner():
+    """Every episode ends at once with -300, so Q is -300 everywhere."""
+
+    def values_after(scale, steps=150):
+        sac = SAC(3, 2, (32, 32), ensemble=2, target_subset=1, value_scale=scale)
+        batch = make_batch(jax.random.key(1))
+        batch = batch._replace(reward=jnp.full(16, -300.0), mask=jnp.zeros(16))
+
+        def step(state, key):
+            return sac.update_critic(state, batch, key, HYPER)[0], None
+
+        keys = jax.random.split(jax.random.key(2), steps)
+        state = jax.jit(lambda state: jax.lax.scan(step, state, keys)[0])(sac.init(jax.random.key(0), 0.1))
+        return np.asarray(sac.values(state.critic, batch.observation, batch.action))
+
+    np.testing.assert_allclose(values_after(20.0), -300.0, rtol=0.1)
+    assert (values_after(1.0) > -200.0).all()
+
+
 def test_sac_reaches_the_known_optimum_of_a_point_task():
     """x' = x + 0.5 u, reward -x'^2 on x in [-1, 1]: the optimum is u = -2 x clipped, the return near 0."""
     sac = SAC(1, 1, (32, 32), ensemble=2, target_subset=1)
