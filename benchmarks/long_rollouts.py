@@ -1,7 +1,7 @@
 """100,000 environment steps of every task: ``python benchmarks/long_rollouts.py [--out results/long_rollouts.json]``.
 
-A hundred environments make a thousand control steps each, with resets in between. Half of the ants walk straight on,
-into the walls; everything else acts at random. Watched are, over all states,
+A hundred environments make a thousand control steps each, with resets in between. Half of the bodies walk straight on,
+into the walls (a humanoid from its feet, and until it falls); the others act at random. Watched are, over all states,
 
 - how many were not finite,
 - height (m) and speed (m/s) of the walking body, and of the ball,
@@ -27,6 +27,7 @@ import numpy as np
 
 import envs
 from envs.physics.walls import cells_in_reach
+from qdos_brax.data.bodies import conduct_of
 from qdos_brax.experts import policies
 from qdos_brax.runs.folder import write_text
 
@@ -45,21 +46,29 @@ def rollouts(env: Any, seed: int = 0) -> dict[str, np.ndarray]:
         Also "start", the (qpos, qvel) before the first step.
     """
     reset_key, angle_key, action_key = jax.random.split(jax.random.key(seed), 3)
-    act = policies.ant_walker().act if env.spec.family.startswith("ant") else None
+    conduct, half = conduct_of(env), NUM_ENVS // 2
+    on_two_legs = conduct.is_down is not None  # which the task drops, and whose walker cannot get up
+    walker = conduct.expert() if on_two_legs else policies.ant_walker()
+    body_qpos, body_qvel = (28, 27) if on_two_legs else (15, 14)
     angle = jax.random.uniform(angle_key, (NUM_ENVS,), minval=-np.pi, maxval=np.pi)
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
 
     def body(state: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         action = jax.random.uniform(key, (NUM_ENVS, env.action_size), minval=-1)
-        if act is not None:
-            walks = (jnp.arange(NUM_ENVS) < NUM_ENVS // 2)[:, None]
-            before = state.pipeline_state
-            action = jnp.where(walks, act(before.qpos[:, :15], before.qvel[:, :14], direction), action)
-        state = jax.vmap(env.step)(state, action)
+        before = state.pipeline_state
+        walk = walker.act(before.qpos[:half, :body_qpos], before.qvel[:half, :body_qvel], direction[:half])
+        state = jax.vmap(env.step)(state, jnp.concatenate([walk, action[half:]]))
         after = state.pipeline_state
         return state, {"qpos": after.qpos, "qvel": after.qvel, "done": state.done > 0, "nan": state.metrics["nan"] > 0}
 
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(reset_key, NUM_ENVS))
+    def on_its_feet(key: jax.Array, ahead: jax.Array) -> Any:
+        return env.reset_to(*conduct.start(env, ahead, key), key=key)
+
+    reset_keys = jax.random.split(reset_key, NUM_ENVS)
+    state = jax.jit(jax.vmap(env.reset))(reset_keys)
+    if on_two_legs:
+        walkers = jax.jit(jax.vmap(on_its_feet))(reset_keys[:half], direction[:half])
+        state = jax.tree.map(lambda walking, other: jnp.concatenate([walking, other[half:]]), walkers, state)
     keys = jax.random.split(action_key, STEPS // NUM_ENVS)
     _, seen = jax.jit(lambda s, k: jax.lax.scan(body, s, k))(state, keys)
     start = {"qpos": state.pipeline_state.qpos[None], "qvel": state.pipeline_state.qvel[None]}
