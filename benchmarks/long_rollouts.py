@@ -47,16 +47,14 @@ def rollouts(env: Any, seed: int = 0) -> dict[str, np.ndarray]:
     """
     reset_key, angle_key, action_key = jax.random.split(jax.random.key(seed), 3)
     conduct, half = conduct_of(env), NUM_ENVS // 2
-    on_two_legs = conduct.is_down is not None  # which the task drops, and whose walker cannot get up
-    walker = conduct.expert() if on_two_legs else policies.ant_walker()
-    body_qpos, body_qvel = (28, 27) if on_two_legs else (15, 14)
+    walker = policies.walker_of(conduct.expert())
     angle = jax.random.uniform(angle_key, (NUM_ENVS,), minval=-np.pi, maxval=np.pi)
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
 
     def body(state: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         action = jax.random.uniform(key, (NUM_ENVS, env.action_size), minval=-1)
         before = state.pipeline_state
-        walk = walker.act(before.qpos[:half, :body_qpos], before.qvel[:half, :body_qvel], direction[:half])
+        walk = walker.act(before.qpos[:half], before.qvel[:half], direction[:half])
         state = jax.vmap(env.step)(state, jnp.concatenate([walk, action[half:]]))
         after = state.pipeline_state
         return state, {"qpos": after.qpos, "qvel": after.qvel, "done": state.done > 0, "nan": state.metrics["nan"] > 0}
@@ -66,7 +64,7 @@ def rollouts(env: Any, seed: int = 0) -> dict[str, np.ndarray]:
 
     reset_keys = jax.random.split(reset_key, NUM_ENVS)
     state = jax.jit(jax.vmap(env.reset))(reset_keys)
-    if on_two_legs:
+    if conduct.is_down is not None:  # the task drops it, and its walker cannot get up
         walkers = jax.jit(jax.vmap(on_its_feet))(reset_keys[:half], direction[:half])
         state = jax.tree.map(lambda walking, other: jnp.concatenate([walking, other[half:]]), walkers, state)
     keys = jax.random.split(action_key, STEPS // NUM_ENVS)

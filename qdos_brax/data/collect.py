@@ -205,7 +205,7 @@ class Collector:
     def __init__(self, env: TaskEnv, policy: policies.Policy, recipe: Recipe) -> None:
         self.env, self.recipe, self.body = env, recipe, bodies.conduct_of(env)
         self.dribbler = policy if isinstance(policy, policies.Dribbles) else None
-        self.walker = policy.walker if isinstance(policy, policies.Dribbles) else policy
+        self.walker = policies.walker_of(policy)
         self.navigator = Navigator(env.layout)
         rate = steps_per_second(env)
         self.check_steps, self.escape_steps = round(CHECK_SECONDS * rate), round(ESCAPE_SECONDS * rate)

@@ -203,6 +203,11 @@ class Dribbler:
         return dribbler_joints(self.walker, qpos, qvel, direction, command)
 
 
+def walker_of(policy: Policy) -> Policy:
+    """What moves the body alone: a dribbler's walker, or the policy itself."""
+    return policy.walker if isinstance(policy, Dribbles) else policy
+
+
 def ant_walker(path: Path | None = None) -> AntWalker:
     """The walking ant, shipped or in ``path``; errors as ``read_actor``."""
     return AntWalker(read_actor(path or shipped("ant_walker")))
