@@ -42,8 +42,15 @@ def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (tmp_path / "presets").mkdir()
     (tmp_path / "antmaze.yaml").write_text("skills: {alpha: 0.3, kl_weight: 0.1, horizon: 10}\nvalues: {n_step: 5}")
     (tmp_path / "antsoccer.yaml").write_text("")
-    preset = "skills: {alpha: 0.4, kl_weight: 0.5, horizon: 8}\nfamilies: {antmaze: {skills: {kl_weight: 0.6}}}"
-    preset += "\nsources: {action: {high_level: {utd: 3}}}"
+    preset = """
+skills: {alpha: 0.4, kl_weight: 0.5, horizon: 8}
+sources: {action: {high_level: {utd: 3, discount: 0.9}}}
+families:
+  antmaze:
+    skills: {kl_weight: 0.6}
+    high_level: {discount: 0.8}
+    sources: {action: {high_level: {discount: 0.7}}}
+"""
     (tmp_path / "presets" / "tiny.yaml").write_text(preset)
     monkeypatch.setattr(configs.layers, "CONFIG_DIR", tmp_path)
     config = load_config("antmaze", "tiny", {"skills.alpha": "0.7", "skills.horizon": 6}, ["skills.alpha=0.8"])
@@ -56,6 +63,9 @@ def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert flat.labels.offline_reward == "min"  # recipe over family and default
     assert flat.skills.horizon == 8  # preset over recipe
     assert (flat.high_level.utd, config.high_level.utd) == (3, 20)  # the preset's section for the recipe's source
+    # A section for the source, over it one for the family, over it the family's for the source.
+    assert (config.high_level.discount, flat.high_level.discount) == (0.8, 0.7)
+    assert load_config("antsoccer", "tiny", {"method": "explore"}).high_level.discount == 0.9
     assert flat.labels.rnd_coefficient == 1.0  # --set over recipe
 
 

@@ -2,7 +2,8 @@
 
 Layers, each laid over the one before: the defaults below (the paper's values), ``configs/<family>.yaml``, the method's
 recipe (``qdos_brax.methods``), ``configs/presets/<preset>.yaml`` (with its own sections: ``sources:``, by the recipe's
-source of behaviour, and ``families:``), the command line's flags, ``--set key=value``.
+source of behaviour, and over it ``families:``, which may hold ``sources:`` again), the command line's flags,
+``--set key=value``.
 
 Two kinds of field are told apart by ``metadata["scan"]``. A scannable field is a number that a learner takes as an
 argument of its jitted program: it may hold a list, and every member of the scan gets its own value without a new

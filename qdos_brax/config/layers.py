@@ -176,10 +176,11 @@ def _read_preset(name: str, family: str, source: str) -> dict[str, Any]:
     path = CONFIG_DIR / "presets" / f"{name}.yaml"
     content = _read_mapping(path)
     by_family = _section(content, "families", families(), path)
-    by_source = _section(content, "sources", sorted({recipe.source for recipe in METHODS.values()}), path)
-    layer = _checked_keys(_flat(content), str(path))
-    for own in (by_source.get(source), by_family.get(family)):
-        layer |= _checked_keys(_flat(own or {}), str(path))
+    layer: dict[str, Any] = {}
+    for own in (content, by_family.get(family) or {}):
+        by_source = _section(own, "sources", sorted({recipe.source for recipe in METHODS.values()}), path)
+        for part in (own, by_source.get(source) or {}):
+            layer |= _checked_keys(_flat(part), str(path))
     return layer
 
 
