@@ -84,7 +84,8 @@ class OnlinePhase:
 
     Each iteration plays one macro step in every environment, stores them, and makes ``utd`` critic steps, one actor
     and one temperature step per macro step played. Of a batch, ``offline_fraction`` is labelled data, the rest online
-    experience.
+    experience. As in the published code of SUPE and ExPLORe the bonus learns from every macro step once, when it was
+    just played, and the labeller as often as the critics do.
 
     Args:
         config: the run's configuration.
@@ -209,11 +210,11 @@ class OnlinePhase:
         self, state: OnlinePhaseState, _: None, frozen: Any, hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[OnlinePhaseState, dict[str, jax.Array]]:
         act_key, update_key, key = jax.random.split(state.key, 3)
-        state, info = self._act(state.replace(key=key), act_key, frozen, hyper)
+        state, newest, info = self._act(state.replace(key=key), act_key, frozen, hyper)
         learn = partial(self._learn, replay=state.replay, env_steps=state.env_steps)
         learn = partial(learn, frozen=frozen, hyper=hyper, data=data)
         keys = jax.random.split(update_key, self._config.high_level.num_envs)
-        learners, losses = jax.lax.scan(learn, state.learners, keys)
+        learners, losses = jax.lax.scan(learn, state.learners, (keys, newest))
 
         learners, healthy = health.keep_finite(state.healthy, learners, state.learners)
         state = state.replace(
@@ -225,8 +226,8 @@ class OnlinePhase:
 
     def _act(
         self, state: OnlinePhaseState, key: jax.Array, frozen: Any, hyper: dict[str, jax.Array]
-    ) -> tuple[OnlinePhaseState, dict[str, jax.Array]]:
-        """One macro step in every environment, stored; episodes that are over start anew."""
+    ) -> tuple[OnlinePhaseState, OnlineRow, dict[str, jax.Array]]:
+        """One macro step in every environment, stored, and their rows[num_envs]; episodes that are over start anew."""
         num_envs = self._config.high_level.num_envs
         first_key, actor_key, reset_key = jax.random.split(key, 3)
         agent = self._agent(state.learners.sac.actor, frozen["skills"], hyper)
@@ -261,24 +262,25 @@ class OnlinePhase:
             first_goal_step=jnp.where(reached, env_steps, state.first_goal_step),
             broken=state.broken + jnp.sum(~result.finite).astype(jnp.int32),
         )
-        return state, {"reached": jnp.sum(result.success), "ended": jnp.sum(over)}
+        return state, rows, {"reached": jnp.sum(result.success), "ended": jnp.sum(over)}
 
     def _learn(
         self,
         learners: Learners,
-        key: jax.Array,
+        given: tuple[jax.Array, OnlineRow],
         replay: replay_buffer.Replay,
         env_steps: jax.Array,
         frozen: Any,
         hyper: dict[str, jax.Array],
         data: DeviceData,
     ) -> tuple[Learners, dict[str, jax.Array]]:
-        """``utd`` critic steps, one actor and temperature step, one step of what labels (on online rows only)."""
+        """Of a macro step, ``given`` its key and row: the labels' steps, ``utd`` of the critics, one of the actor."""
         high = self._config.high_level
+        (key, newest), active = given, env_steps >= self._config.labels.start_env_steps
         label_key, actor_key, critic_key = jax.random.split(key, 3)
-        online = replay_buffer.sample(replay, label_key, high.batch_size)
-        active = env_steps >= self._config.labels.start_env_steps
-        learners = self._learn_labels(learners, online, hyper, active)
+        rnd = self._novelty.learn(learners.rnd, newest.observation[None], newest.action[None], hyper, active)
+        learners = learners.replace(rnd=rnd)
+        learners = self._learn_rewards(learners, label_key, replay, hyper, active)
 
         target_entropy, reference = self._regulariser(frozen["skills"], hyper)
         sac_hyper = SACHyper(
@@ -296,7 +298,7 @@ class OnlinePhase:
         sac, critic_info = jax.lax.scan(critic_step, learners.sac, jax.random.split(critic_key, high.utd))
         batch_key, update_key = jax.random.split(actor_key)
         sac, actor_info = self._sac.update_actor(sac, sample(batch_key).observation, update_key, sac_hyper, reference)
-        bonus = self._novelty.of(learners.rnd, online.observation, online.action, hyper)
+        bonus = self._novelty.of(learners.rnd, newest.observation, newest.action, hyper)
         info = jax.tree.map(jnp.mean, critic_info) | actor_info | {"bonus": jnp.mean(bonus)}
         return learners.replace(sac=sac), info
 
@@ -310,14 +312,24 @@ class OnlinePhase:
 
         return -hyper["high_level.target_divergence"], log_prior
 
-    def _learn_labels(
-        self, learners: Learners, online: OnlineRow, hyper: dict[str, jax.Array], active: jax.Array
+    def _learn_rewards(
+        self,
+        learners: Learners,
+        key: jax.Array,
+        replay: replay_buffer.Replay,
+        hyper: dict[str, jax.Array],
+        active: jax.Array,
     ) -> Learners:
-        rnd = self._novelty.learn(learners.rnd, online.observation, online.action, hyper, active)
-        rows = MacroRows(online.observation, online.reward, online.mask, online.next_observation)
-        rate = hyper["labels.reward_learning_rate"]
-        labeller = self._labeller.learn(learners.labeller, rows, online.action, rate, active)
-        return learners.replace(rnd=rnd, labeller=labeller)
+        """As many steps of the labeller as of the critics, on as many online rows (SUPE's and ExPLORe's code)."""
+        high, rate = self._config.high_level, hyper["labels.reward_learning_rate"]
+
+        def step(labeller: Any, key: jax.Array) -> tuple[Any, None]:
+            online = replay_buffer.sample(replay, key, high.batch_size - self._offline)
+            rows = MacroRows(online.observation, online.reward, online.mask, online.next_observation)
+            return self._labeller.learn(labeller, rows, online.action, rate, active), None
+
+        labeller, _ = jax.lax.scan(step, learners.labeller, jax.random.split(key, high.utd))
+        return learners.replace(labeller=labeller)
 
     def _sample(
         self,

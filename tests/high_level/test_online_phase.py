@@ -8,7 +8,7 @@ import pytest
 from qdos_brax import config as configs
 from qdos_brax.data.device import MacroRows, to_device
 from qdos_brax.high_level.online_phase import OnlinePhase
-from qdos_brax.labels.bonus import RNDBonus
+from qdos_brax.labels.bonus import NoBonus, RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
@@ -37,15 +37,14 @@ def plane():
     return data, normaliser, source, artifacts
 
 
-def online_phase(plane, config):
+def online_phase(plane, config, labeller=None, bonus=None):
     """(phase, artifacts, keys) for the members of ``config``, on the shared skills."""
     data, normaliser, source, artifacts = plane
     population = Population(configs.population_hyper(config))
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
-    bonus = RNDBonus(RND(2 + source.width, config.labels.rnd_hidden, config.labels.rnd_features))
-    phase = OnlinePhase(
-        config, PointEnv(), data, normaliser, population, source, DataReward(), bonus, steps_per_chunk=100
-    )
+    bonus = bonus or RNDBonus(RND(2 + source.width, config.labels.rnd_hidden, config.labels.rnd_features))
+    labeller = labeller or DataReward()
+    phase = OnlinePhase(config, PointEnv(), data, normaliser, population, source, labeller, bonus, steps_per_chunk=100)
     repeated = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), artifacts)
     return phase, repeated, phase_keys(seeds, 2)
 
@@ -217,6 +216,40 @@ def test_reward_model_loss_by_hand():
     # Everything 0: reward error 4 and 0, and -log(1/2) for either mask.
     loss = model.loss(params, jnp.ones((2, 1)), jnp.ones((2, 1)), jnp.array([2.0, 0.0]), jnp.array([1.0, 0.0]))
     np.testing.assert_allclose(loss, 2 + np.log(2), rtol=1e-6)
+
+
+class CountingReward(DataReward):
+    """Counts its steps and the rows of each."""
+
+    def init(self, key):
+        return {"steps": jnp.zeros((), jnp.int32), "rows": jnp.zeros((), jnp.int32)}
+
+    def learn(self, state, rows, action, learning_rate, active):
+        return {"steps": state["steps"] + active, "rows": state["rows"] + active * len(rows.reward)}
+
+
+class SummingBonus(NoBonus):
+    """Sums up what it is taught."""
+
+    def init(self, key):
+        return {"steps": jnp.zeros((), jnp.int32), "sum": jnp.zeros(2)}
+
+    def learn(self, state, observation, action, hyper, active):
+        return {"steps": state["steps"] + active * len(observation), "sum": state["sum"] + active * observation.sum(0)}
+
+
+def test_the_bonus_learns_every_macro_step_once_and_the_labeller_as_often_as_the_critics(plane):
+    settings = {"labels.start_env_steps": 0, "high_level.utd": 3, "high_level.offline_fraction": 0.25}
+    config = point_config(**settings)
+    phase, artifacts, keys = online_phase(plane, config, CountingReward(), SummingBonus())
+    state, _ = phase.chunk(phase.init(keys, artifacts))
+    learners, replay = state.learners, state.replay
+    played = int(replay.size[0])
+    assert played > config.high_level.num_envs
+    assert int(learners.rnd["steps"][0]) == played
+    np.testing.assert_allclose(learners.rnd["sum"][0], replay.data.observation[0, :played].sum(0), rtol=1e-4, atol=1e-4)
+    assert int(learners.labeller["steps"][0]) == 3 * played == int(state.update[0])
+    assert int(learners.labeller["rows"][0]) == 3 * played * round(0.75 * config.high_level.batch_size)
 
 
 def test_rnd_error_falls_where_it_was_trained_and_stays_elsewhere():
