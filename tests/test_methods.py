@@ -158,7 +158,7 @@ def test_the_guide_acts_first_and_only_so_long() -> None:
     hyper = {key: value[0] for key, value in phase._hyper.items()}
     act = jax.jit(phase._act)
     for n in range(5):
-        state, _ = act(state, jax.random.key(n), {"skills": {}, "guide": {}}, hyper)
+        state, _, _ = act(state, jax.random.key(n), {"skills": {}, "guide": {}}, hyper)
     actions = np.asarray(state.replay.data.action[:10]).reshape(5, 2, 2)
     guided = (np.abs(actions - 0.123) < 1e-6).all(axis=-1)
     np.testing.assert_array_equal(guided, [[True, False]] * 3 + [[False, False]] * 2)
@@ -176,7 +176,7 @@ def test_the_bonus_is_on_the_rows_it_is_asked_for(rows: str) -> None:
     state = jax.tree.map(lambda x: x[0], phase.init(jax.random.split(jax.random.key(0), 1), labels))
     frozen = {"skills": {}, "labels": labels["labels"][0]}
     hyper = {key: value[0] for key, value in phase._hyper.items()}
-    state, _ = jax.jit(phase._act)(state, jax.random.key(1), frozen, hyper)
+    state, _, _ = jax.jit(phase._act)(state, jax.random.key(1), frozen, hyper)
     batch = phase._sample(state.learners, state.replay, jax.random.key(2), frozen=frozen, hyper=hyper, data=phase._data)
     offline, online = np.split(np.asarray(batch.reward), 2)
     assert (online > -1).all()  # each earned -1 and a bonus
