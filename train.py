@@ -2,7 +2,7 @@
 
 import sys
 
-from qdos_brax.cli import train_main
+from qdos_brax.commands.cli import train_main
 
 if __name__ == "__main__":
     sys.exit(train_main())

@@ -20,12 +20,14 @@ import numpy as np
 
 import envs
 from qdos_brax import config as configs
-from qdos_brax.data import cache, formats, quality
+from qdos_brax.collection import default_set
+from qdos_brax.data import formats, quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, macro_rows, to_device
 from qdos_brax.data.segments import window
 from qdos_brax.methods.build import value_phase
-from qdos_brax.population import Population
+from qdos_brax.population.members import Population
+from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.segment_weights import LatentWeights, SegmentBatch
 from qdos_brax.skills.skill_phase import SkillPhase
@@ -33,7 +35,6 @@ from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.value_phase import ValuePhase, over_rows
 from qdos_brax.skills.values import IQL
 from qdos_brax.skills.weights import advantage_weights, scaled_advantage
-from qdos_brax.train_flow import prepare_jax
 
 CONFIGURED = {"graph": ("segment", "latent"), "iql": ("segment", "latent", "transition")}
 """Advantages by value estimator."""
@@ -164,7 +165,7 @@ def main() -> None:
     config = configs.load_config(args.env, args.preset, {}, args.set)
     env = envs.make(args.env, physics="mujoco")
     d = config.data
-    path = args.dataset or cache.default_dataset(
+    path = args.dataset or default_set.default_dataset(
         env, transitions=d.transitions, degraded_share=d.degraded_share, noise=d.noise, seed=d.seed, num_envs=d.num_envs
     )
     dataset = formats.read(path, env)

@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 
 import envs
-from qdos_brax.data.bodies import conduct_of
-from qdos_brax.data.collect import CHUNK_STEPS, Collector
-from qdos_brax.data.recipes import degraded, episode_kinds
-from qdos_brax.runs.folder import write_text
+from qdos_brax.collection.bodies import conduct_of
+from qdos_brax.collection.collect import CHUNK_STEPS, Collector
+from qdos_brax.collection.recipes import degraded, episode_kinds
+from qdos_brax.files import write_text
 
 TASKS = ("antmaze-large", "antsoccer-arena", "humanoidmaze-medium")
 

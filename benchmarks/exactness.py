@@ -28,8 +28,8 @@ import mujoco
 import numpy as np
 
 import envs
-from qdos_brax.experts import policies
-from qdos_brax.runs.folder import write_text
+from qdos_brax.collection.experts import policies
+from qdos_brax.files import write_text
 
 STATES = 1000
 ROLLOUTS = 125  # also the batch of every compiled step

@@ -30,10 +30,17 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from qdos_brax.files import write_text
 from qdos_brax.high_level import replay as replay_buffer
-from qdos_brax.high_level.sac import ADAM, SAC, Batch, SACHyper, adam_step
-from qdos_brax.networks import DiagonalGaussian, gaussian_kl, gaussian_log_prob, gaussian_sample, tanh_gaussian_sample
-from qdos_brax.runs.folder import write_text
+from qdos_brax.high_level.sac import SAC, Batch, SACHyper
+from qdos_brax.nn.networks import (
+    DiagonalGaussian,
+    gaussian_kl,
+    gaussian_log_prob,
+    gaussian_sample,
+    tanh_gaussian_sample,
+)
+from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.skills.vae import Segments, SkillModel
 
 OBSERVATION, LATENT, ACTION = 29, 8, 8
@@ -227,7 +234,7 @@ class Encoder(nn.Module):
 
     @nn.compact
     def __call__(self, observations: jax.Array, actions: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """See ``qdos_brax.networks.SegmentEncoder``."""
+        """See ``qdos_brax.nn.networks.SegmentEncoder``."""
         x = jnp.concatenate([observations, actions], axis=-1)
         for _ in range(2):
             forward = nn.RNN(nn.GRUCell(256))(x)

@@ -27,9 +27,9 @@ import numpy as np
 
 import envs
 from envs.physics.walls import cells_in_reach
-from qdos_brax.data.bodies import conduct_of
-from qdos_brax.experts import policies
-from qdos_brax.runs.folder import write_text
+from qdos_brax.collection.bodies import conduct_of
+from qdos_brax.collection.experts import policies
+from qdos_brax.files import write_text
 
 STEPS = 100_000
 NUM_ENVS = 100

@@ -239,7 +239,7 @@ def write(path: Path, rows: list[dict[str, Any]], seconds: float) -> None:
     import jax
     import mujoco
 
-    from qdos_brax.runs.folder import write_text
+    from qdos_brax.files import write_text
 
     machine = {"processor": platform.processor() or platform.machine(), "cores": CORES}
     versions = {"python": platform.python_version(), "jax": jax.__version__, "mujoco": mujoco.__version__}

@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from qdos_brax.runs.folder import write_text
+from qdos_brax.files import write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = ("--env", "antmaze-medium", "--preset", "smoke")

@@ -2,7 +2,7 @@
 
 import sys
 
-from qdos_brax.cli import main
+from qdos_brax.commands.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -16,9 +16,11 @@ from typing import Any
 import jax
 import pytest
 
-from qdos_brax import cli, memory, train_flow
+from qdos_brax import experiment
+from qdos_brax.analysis import inside
+from qdos_brax.commands import cli
 from qdos_brax.errors import UserError
-from qdos_brax.methods import inside
+from qdos_brax.population import memory
 from qdos_brax.runs import comparison
 from tests.runs import toy
 
@@ -47,14 +49,14 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         kind = DyingPhase if config.out.endswith("killed/supe") and built.count("supe") == 1 else toy.ToyPhase
         return [kind(phase.name, phase.num_chunks) for phase in toy.phases()]
 
-    monkeypatch.setattr(train_flow, "_default_data", lambda config, env: data)
-    monkeypatch.setattr(train_flow.formats, "read", lambda path, env: None)
-    monkeypatch.setattr(train_flow, "build_phases", phases)
+    monkeypatch.setattr(experiment, "_default_data", lambda config, env: data)
+    monkeypatch.setattr(experiment.formats, "read", lambda path, env: None)
+    monkeypatch.setattr(experiment, "build_phases", phases)
     monkeypatch.setattr(
-        train_flow, "plan_members", lambda *args: memory.Plan((jax.local_devices()[0],), 1, False, "toys")
+        experiment, "plan_members", lambda *args: memory.Plan((jax.local_devices()[0],), 1, False, "toys")
     )
     monkeypatch.setattr(inside, "look_inside", lambda path: None)  # toys have nothing inside
-    monkeypatch.setattr(train_flow.jax, "clear_caches", lambda: None)  # the other tests' programs are theirs
+    monkeypatch.setattr(experiment.jax, "clear_caches", lambda: None)  # the other tests' programs are theirs
     return built
 
 
@@ -89,8 +91,8 @@ def test_killed_comparison_goes_on_exactly(
 
 def test_alpha_is_not_scanned_where_it_weighs_nothing(tmp_path: Path, built: list[str]) -> None:
     configs = cli.configs_from_args(cli.train_parser().parse_args(shlex.split(f"{command()} --alpha 0.1,0.3")))
-    env = train_flow._make_env(configs["qdos"])
-    alphas = [train_flow._resolved(config, env, tmp_path).skills.alpha for config in configs.values()]
+    env = experiment._make_env(configs["qdos"])
+    alphas = [experiment._resolved(config, env, tmp_path).skills.alpha for config in configs.values()]
     assert alphas == [(0.1, 0.3), 0.0]
 
 
@@ -120,7 +122,7 @@ def test_nothing_starts_on_a_wrong_flag(
 
 def test_second_process_is_refused(tmp_path: Path, built: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     comparison.create(tmp_path / "c", {"qdos": "env: antmaze-medium-task1\n", "supe": "env: antmaze-medium-task1\n"})
-    with train_flow.RunFolder(tmp_path / "c").held():
+    with experiment.RunFolder(tmp_path / "c").held():
         assert train(f"--resume {tmp_path}/c") == 2
     assert "another process is at work" in capsys.readouterr().err and not built
 

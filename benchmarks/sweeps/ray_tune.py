@@ -33,10 +33,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from qdos_brax.cli import Parser, configs_from_args, positive, train_parser
+from qdos_brax.commands.cli import Parser, configs_from_args, positive, train_parser
 from qdos_brax.config.scan import distribution
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import RunFolder, user_errors, write_text
+from qdos_brax.files import user_errors, write_text
+from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import read_rows, step_of
 
 TRAIN = Path(__file__).resolve().parents[2] / "train.py"

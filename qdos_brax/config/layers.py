@@ -13,11 +13,11 @@ from typing import Any
 import yaml
 
 from qdos_brax.config import scan
+from qdos_brax.config.methods import METHODS
+from qdos_brax.config.methods import settings as method_settings
 from qdos_brax.config.rules import choices_in, convert, nearest
 from qdos_brax.config.schema import Config, leaves, plain
 from qdos_brax.errors import UserError
-from qdos_brax.methods import METHODS
-from qdos_brax.methods import settings as method_settings
 
 # The folder beside the packages: the repository's root in an editable install, site-packages in a built wheel.
 CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"

@@ -24,7 +24,7 @@ from qdos_brax import __version__
 from qdos_brax.data import cache, sources
 from qdos_brax.data.sources import Source
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import write_text
+from qdos_brax.files import write_text
 from qdos_brax.runs.progress import Progress
 
 _PIECE = 1 << 20  # bytes per step of the progress bar, and at most per read

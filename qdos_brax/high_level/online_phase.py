@@ -12,7 +12,6 @@ import numpy as np
 from brax.envs.base import Env, State
 from flax import struct
 
-from qdos_brax import health
 from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData, MacroRows, Normaliser, macro_rows
 from qdos_brax.high_level import replay as replay_buffer
@@ -23,8 +22,9 @@ from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
 from qdos_brax.high_level.sac import SAC, Batch, Reference, SACHyper, SACState
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
-from qdos_brax.memory import working_bytes
-from qdos_brax.population import Population
+from qdos_brax.population import health
+from qdos_brax.population.members import Population
+from qdos_brax.population.memory import working_bytes
 from qdos_brax.skills.source import SkillSource
 
 NEVER = -1

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from qdos_brax.networks import DiagonalGaussian, Ensemble, tanh_gaussian_sample
+from qdos_brax.nn.networks import DiagonalGaussian, Ensemble, tanh_gaussian_sample
+from qdos_brax.nn.optim import ADAM, adam_step, polyak
 
 Params = Any
 # (observation[B], action[B]) -> log density[B] that the actor is held against; without one, it is uniform (SAC).
@@ -53,20 +54,6 @@ class SACState(struct.PyTreeNode):
     actor_moments: optax.OptState
     critic_moments: optax.OptState
     temperature_moments: optax.OptState
-
-
-ADAM = optax.scale_by_adam()
-
-
-def adam_step(params: Params, moments: optax.OptState, grads: Params, learning_rate: Any) -> tuple[Params, Any]:
-    """One Adam step with a learning rate that may be traced: (new parameters, new moments)."""
-    updates, moments = ADAM.update(grads, moments, params)
-    return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), moments
-
-
-def polyak(target: Params, params: Params, rate: jax.Array | float) -> Params:
-    """``target`` moved towards ``params`` by ``rate`` of the way."""
-    return jax.tree.map(lambda t, p: t + rate * (p - t), target, params)
 
 
 class SAC:

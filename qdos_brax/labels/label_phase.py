@@ -12,9 +12,9 @@ from flax import struct
 from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import window
-from qdos_brax.memory import working_bytes
-from qdos_brax.networks import gaussian_sample
-from qdos_brax.population import Population
+from qdos_brax.nn.networks import gaussian_sample
+from qdos_brax.population.members import Population
+from qdos_brax.population.memory import working_bytes
 from qdos_brax.skills.source import SkillSource
 from qdos_brax.skills.vae import Segments
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from qdos_brax.high_level.sac import ADAM, adam_step
-from qdos_brax.networks import MLP
+from qdos_brax.nn.networks import MLP
+from qdos_brax.nn.optim import ADAM, adam_step
 
 
 class RNDState(struct.PyTreeNode):

@@ -11,7 +11,7 @@ import optax
 from flax import struct
 
 from qdos_brax.data.device import DeviceData
-from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.offline.policy import GaussianPolicy, Params, weighted_imitation_loss
 from qdos_brax.offline.rows import random_rows
 

@@ -24,8 +24,8 @@ import optax
 from flax import struct
 
 from qdos_brax.data.device import DeviceData
-from qdos_brax.high_level.sac import ADAM, adam_step, polyak
-from qdos_brax.networks import MLP, DiagonalGaussian, Ensemble, gaussian_kl, gaussian_log_prob, gaussian_sample
+from qdos_brax.nn.networks import MLP, DiagonalGaussian, Ensemble, gaussian_kl, gaussian_log_prob, gaussian_sample
+from qdos_brax.nn.optim import ADAM, adam_step, polyak
 from qdos_brax.offline.iql_policy import regression_weight
 from qdos_brax.offline.policy import GaussianPolicy, weighted_imitation_loss
 from qdos_brax.offline.rows import random_rows, transitions

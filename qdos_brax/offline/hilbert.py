@@ -18,12 +18,12 @@ import optax
 from flax import struct
 
 from qdos_brax.data.device import DeviceData
-from qdos_brax.high_level.sac import ADAM, adam_step, polyak
-from qdos_brax.networks import MLP
+from qdos_brax.nn.networks import MLP
+from qdos_brax.nn.optim import ADAM, adam_step, polyak
+from qdos_brax.nn.vectors import unit_vector
 from qdos_brax.offline.iql_policy import IQLPolicy, IQLPolicyHyper, IQLPolicyState
 from qdos_brax.offline.rows import random_rows
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper
-from qdos_brax.vectors import unit_vector
 
 Params = Any
 _HEADS = 2  # phi and its twin; skills and distances are those of the first

@@ -15,7 +15,7 @@ import optax
 from flax import struct
 
 from qdos_brax.data.device import DeviceData
-from qdos_brax.high_level.sac import ADAM, adam_step
+from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.offline.policy import GaussianPolicy, Params, weighted_imitation_loss
 from qdos_brax.offline.rows import random_rows, transitions
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState

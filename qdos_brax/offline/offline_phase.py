@@ -12,13 +12,13 @@ import numpy as np
 from brax.envs.base import Env
 from flax import struct
 
-from qdos_brax import health
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.high_level.agent import Player
 from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
-from qdos_brax.memory import working_bytes
 from qdos_brax.offline.learner import Learner
-from qdos_brax.population import Population
+from qdos_brax.population import health
+from qdos_brax.population.members import Population
+from qdos_brax.population.memory import working_bytes
 
 
 class OfflinePhaseState(struct.PyTreeNode):

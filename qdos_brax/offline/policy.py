@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from qdos_brax.networks import LOG_STD_MAX, LOG_STD_MIN, MLP, gaussian_log_prob
+from qdos_brax.nn.networks import LOG_STD_MAX, LOG_STD_MIN, MLP, gaussian_log_prob
 
 Params = dict[str, dict[str, jax.Array]]
 

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import replacing
+from qdos_brax.files import replacing
 
 _BINS_PER_CELL = 8
 

@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from qdos_brax.files import replacing
 from qdos_brax.report.parts import PALETTE
 from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
 from qdos_brax.report.study import Study, plain, short
-from qdos_brax.runs.folder import replacing
 
 TICKS = 8  # values of a scan that can all be written on its axis
 MEASURES = (("eval/success", "success"), ("eval/return", "return"))

@@ -1,4 +1,4 @@
-"""What was seen inside the runs, read from their inside.npz; what its arrays are says ``qdos_brax.methods.inside``."""
+"""What was seen inside the runs, read from their inside.npz; what its arrays are says ``qdos_brax.analysis.inside``."""
 
 from __future__ import annotations
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import jinja2
 
+from qdos_brax.files import write_text
 from qdos_brax.report.curves import colours_of
 from qdos_brax.report.looks import Look
 from qdos_brax.report.parts import Section, member_id
 from qdos_brax.report.sections import sections
 from qdos_brax.report.study import Study
-from qdos_brax.runs.folder import write_text
 
 _SHOWN_AS_THEY_ARE = ("title", "text", "cards", "choices", "tables", "images", "listings", "opened")
 

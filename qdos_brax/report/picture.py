@@ -10,7 +10,7 @@ import matplotlib.image
 import envs
 from envs.render import NoOpenGL, Renderer
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import user_errors
+from qdos_brax.files import user_errors
 
 
 def draw_task(name: str, out: Path) -> None:

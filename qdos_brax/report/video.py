@@ -12,7 +12,7 @@ from typing import IO
 import numpy as np
 
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import user_errors
+from qdos_brax.files import user_errors
 
 
 @contextlib.contextmanager

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qdos_brax.errors import UserError
+from qdos_brax.files import user_errors, write_text
 from qdos_brax.report.curves import draw_curves, draw_scans
 from qdos_brax.report.looks import read_looks
 from qdos_brax.report.page import write_page
 from qdos_brax.report.stills import draw_stills
 from qdos_brax.report.study import read_study
 from qdos_brax.report.tables import Table, first_goal_csv, success_csv, tables
-from qdos_brax.runs.folder import user_errors, write_text
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import refusal
+from qdos_brax.files import refusal
 
 _FORMAT = 1
 _KEPT = 2

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import RunFolder, user_errors, write_text
+from qdos_brax.files import user_errors, write_text
+from qdos_brax.runs.folder import RunFolder
 
 _FILE = "comparison.json"
 

@@ -1,9 +1,8 @@
-"""The run folder: what lies where, who may write to it, and how a file is written without ever being half there."""
+"""The run folder: what lies where, and who may write to it."""
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import json
 import os
@@ -13,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from qdos_brax.errors import UserError
-
-_PARTIAL = ".partial"
+from qdos_brax.files import is_partial, user_errors
 
 
 class RunFolder:
@@ -58,7 +56,7 @@ class RunFolder:
                 )
             before_training = {folder.config, folder.provenance, folder.checkpoints, folder.path / ".lock"}
             found = set(folder.path.iterdir()) if folder.path.exists() else set()
-            if any(path not in before_training and not _is_partial(path) for path in found):
+            if any(path not in before_training and not is_partial(path) for path in found):
                 raise UserError(f"{folder.path} is not empty; choose another --out")
             folder.checkpoints.mkdir(parents=True, exist_ok=True)
         return folder
@@ -120,53 +118,3 @@ def new_path(root: str | Path, name: str) -> Path:
         count += 1
         path = base.with_name(f"{base.name}-{count}")
     return path
-
-
-def write_text(path: Path, text: str) -> None:
-    """Replaces ``path`` by ``text`` at once: a reader, or a run that goes on after a kill, sees the old or the new."""
-    with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A file of the same ending to write to, which takes ``path``'s place at the end; nothing changes on an error."""
-    partial = path.with_name(f".{path.stem}{_PARTIAL}{path.suffix}")
-    with user_errors(path):
-        try:
-            yield partial
-            os.replace(partial, path)
-        finally:
-            with contextlib.suppress(OSError):  # of a folder that cannot be written, which is reported already
-                partial.unlink()
-
-
-def _is_partial(path: Path) -> bool:
-    """Whether it is a file that a kill left half written."""
-    return path.name.startswith(".") and _PARTIAL in path.name
-
-
-@contextlib.contextmanager
-def user_errors(path: Path) -> Iterator[None]:
-    """Turns what the file system refuses into one clear line."""
-    try:
-        yield
-    except OSError as error:
-        raise UserError(refusal(path, error)) from error
-
-
-def refusal(path: Path, error: OSError) -> str:
-    """The line for an OSError: what could not be written, why, and what helps."""
-    mends = {
-        errno.ENOSPC: "free some space and go on with --resume",
-        errno.EDQUOT: "free some space and go on with --resume",
-        errno.EROFS: "choose a folder that can be written, with --out",
-        errno.EACCES: "choose a folder that can be written, with --out",
-        errno.EPERM: "choose a folder that can be written, with --out",
-        errno.ENOTDIR: "choose another folder with --out",
-        errno.EEXIST: "choose another folder with --out",
-    }
-    mend = mends.get(error.errno or 0)
-    return f"cannot write {path}: {error.strerror or error}" + (f"; {mend}" if mend else "")

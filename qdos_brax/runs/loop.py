@@ -16,9 +16,10 @@ import jax
 import numpy as np
 
 from qdos_brax.errors import UserError
+from qdos_brax.files import write_text
 from qdos_brax.runs import checkpoint, signals
 from qdos_brax.runs.checkpoint import Artifacts, CheckpointStore
-from qdos_brax.runs.folder import RunFolder, write_text
+from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.live import MemberBoard
 from qdos_brax.runs.metrics import MetricsTable, Observer
 from qdos_brax.runs.progress import Progress

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import user_errors, write_text
+from qdos_brax.files import user_errors, write_text
 
 Row = dict[str, str]
 _FIRST = ("phase", "env_steps", "update", "eval/success", "eval/return")

@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 
 from qdos_brax.errors import UserError
+from qdos_brax.files import user_errors, write_text
 from qdos_brax.runs.checkpoint import Artifacts, CheckpointStore, Position
-from qdos_brax.runs.folder import RunFolder, user_errors, write_text
+from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import Row, read_rows, write_rows
 
 _PARTS = "processes"

@@ -12,7 +12,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
-from qdos_brax.runs.folder import user_errors
+from qdos_brax.files import user_errors
 from qdos_brax.runs.metrics import Row, measured, step_of
 
 

@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from qdos_brax.errors import UserError
-from qdos_brax.runs.folder import RunFolder, write_text
+from qdos_brax.files import write_text
+from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import Row, measured, step_of
 
 PROJECT = "qdos-brax"

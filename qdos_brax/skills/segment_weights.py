@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from qdos_brax.data.device import MacroRows
-from qdos_brax.high_level.sac import ADAM, adam_step
-from qdos_brax.networks import Ensemble
+from qdos_brax.nn.networks import Ensemble
+from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.skills.weights import scaled_advantage
 
 

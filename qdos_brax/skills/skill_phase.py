@@ -11,13 +11,13 @@ import numpy as np
 import optax
 from flax import struct
 
-from qdos_brax import health
 from qdos_brax.config import Config, SkillsConfig
 from qdos_brax.data.device import DeviceData, macro_rows
 from qdos_brax.data.segments import window
-from qdos_brax.high_level.sac import ADAM, adam_step
-from qdos_brax.memory import working_bytes
-from qdos_brax.population import Population
+from qdos_brax.nn.optim import ADAM, adam_step
+from qdos_brax.population import health
+from qdos_brax.population.members import Population
+from qdos_brax.population.memory import working_bytes
 from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights

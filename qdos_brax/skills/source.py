@@ -12,10 +12,10 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from qdos_brax.latent_map import MARGIN, Prior, latent_map
-from qdos_brax.networks import gaussian_log_prob, gaussian_sample
+from qdos_brax.nn.networks import gaussian_log_prob, gaussian_sample
+from qdos_brax.nn.vectors import unit_vector
+from qdos_brax.skills.latent_map import MARGIN, Prior, latent_map
 from qdos_brax.skills.vae import Posterior, Segments, SkillModel
-from qdos_brax.vectors import unit_vector
 
 Box = jax.Array | float  # half the side of the box of latents, ``skills.latent_box``
 

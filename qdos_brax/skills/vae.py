@@ -8,13 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from qdos_brax.networks import (
-    DiagonalGaussian,
-    SegmentEncoder,
-    gaussian_kl,
-    gaussian_log_prob,
-    gaussian_sample,
-)
+from qdos_brax.nn.networks import DiagonalGaussian, SegmentEncoder, gaussian_kl, gaussian_log_prob, gaussian_sample
 
 Params = Any
 

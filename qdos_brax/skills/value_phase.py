@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from qdos_brax import health
 from qdos_brax.config import Config, SkillsConfig, ValuesConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import macro_return, window
-from qdos_brax.memory import working_bytes
-from qdos_brax.population import Population
+from qdos_brax.population import health
+from qdos_brax.population.members import Population
+from qdos_brax.population.memory import working_bytes
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState
 from qdos_brax.skills.weights import scaled_advantage, segment_advantage, transition_advantage
 

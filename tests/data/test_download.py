@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from qdos_brax.cli import main, train_main
+from qdos_brax.commands.cli import main, train_main
 from qdos_brax.data import download, sources
 from qdos_brax.data.sources import Source
 from qdos_brax.errors import UserError

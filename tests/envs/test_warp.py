@@ -12,7 +12,7 @@ import pytest
 
 import envs
 from envs.physics import why_not
-from qdos_brax import doctor
+from qdos_brax.commands import doctor
 
 
 def test_it_is_refused_with_what_mends_it(monkeypatch: pytest.MonkeyPatch) -> None:

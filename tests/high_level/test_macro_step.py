@@ -8,7 +8,7 @@ from brax.envs.base import Env, State
 
 from qdos_brax.high_level.evaluation import evaluate
 from qdos_brax.high_level.macro_step import macro_step, reset_done
-from qdos_brax.latent_map import Prior, latent_map
+from qdos_brax.skills.latent_map import Prior, latent_map
 
 
 class Line(Env):

@@ -13,7 +13,7 @@ from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
-from qdos_brax.population import Population
+from qdos_brax.population.members import Population
 from qdos_brax.skills.segment_weights import UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.source import TrajectorySource

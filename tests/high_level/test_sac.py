@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qdos_brax.high_level.sac import ADAM, SAC, Batch, SACHyper, adam_step
-from qdos_brax.networks import gaussian_log_prob
+from qdos_brax.high_level.sac import SAC, Batch, SACHyper
+from qdos_brax.nn.networks import gaussian_log_prob
+from qdos_brax.nn.optim import ADAM, adam_step
 
 HYPER = SACHyper(learning_rate=3e-3, discount=0.9, target_rate=0.05, target_entropy=-1.0)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qdos_brax import cli
+from qdos_brax.commands import cli
 from qdos_brax.report.headlines import cards
 from qdos_brax.report.series import curves, scans, surfaces
 from qdos_brax.report.study import read_study

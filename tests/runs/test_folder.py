@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from qdos_brax.errors import UserError
+from qdos_brax.files import write_text
 from qdos_brax.runs import signals
-from qdos_brax.runs.folder import RunFolder, new_path, write_text
+from qdos_brax.runs.folder import RunFolder, new_path
 
 
 def made(path: Path) -> RunFolder:

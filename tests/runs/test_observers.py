@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-from qdos_brax import cli
+from qdos_brax.commands import cli
 from qdos_brax.errors import UserError
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.live import MemberBoard

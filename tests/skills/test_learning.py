@@ -9,8 +9,8 @@ import pytest
 
 from qdos_brax import config as configs
 from qdos_brax.data.device import to_device
-from qdos_brax.networks import gaussian_sample
-from qdos_brax.population import Population
+from qdos_brax.nn.networks import gaussian_sample
+from qdos_brax.population.members import Population
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qdos_brax.networks import gaussian_kl, gaussian_sample
+from qdos_brax.nn.networks import gaussian_kl, gaussian_sample
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.values import IQL, ValueBatch, expectile_loss
 from qdos_brax.skills.weights import (

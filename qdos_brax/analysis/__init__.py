@@ -1,0 +1,1 @@
+"""Finished runs: loading, evaluating, filming, and looking inside."""

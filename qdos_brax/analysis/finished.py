@@ -1,0 +1,122 @@
+"""A finished run: its agent, and how well it plays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from qdos_brax import config as configs
+from qdos_brax.config import Config
+from qdos_brax.config.methods import METHODS
+from qdos_brax.data.device import Normaliser
+from qdos_brax.errors import UserError
+from qdos_brax.high_level.agent import Agent, Player
+from qdos_brax.high_level.evaluation import evaluate
+from qdos_brax.high_level.online_phase import high_level_sac
+from qdos_brax.methods.build import make_policy, make_source
+from qdos_brax.offline.player import FlatPlayer
+from qdos_brax.population.members import Population
+from qdos_brax.runs.checkpoint import final_artifacts
+from qdos_brax.runs.folder import RunFolder
+
+
+class TrainedRun(NamedTuple):
+    """What a finished run has learned.
+
+    Attributes:
+        config: the run's configuration.
+        env: its task.
+        artifacts: parameters with a leading member axis.
+        hyper: what a scan may vary, by dotted key, with a leading member axis.
+        agent: (artifacts, hyper) of one member -> what plays.
+    """
+
+    config: Config
+    env: Any
+    artifacts: Any
+    hyper: dict[str, jax.Array]
+    agent: Callable[[Any, Any], Player]
+
+
+def load_run(run: Path) -> TrainedRun:
+    """The agents of a finished run.
+
+    Args:
+        run: the run folder.
+
+    Raises:
+        UserError: it is no run folder, or the run has not ended.
+    """
+    folder = RunFolder.open(str(run))
+    config = configs.from_yaml(folder.config)
+    if folder.read_summary() is None:
+        raise UserError(f"the run in {run} has not ended; go on with: python train.py --resume {run}")
+    env = envs.make(config.env, physics=config.physics)
+    return TrainedRun(
+        config,
+        env,
+        final_artifacts(folder.checkpoints, configs.config_hash(config)),
+        {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()},
+        _player(config, env),
+    )
+
+
+def _player(config: Config, env: Any) -> Callable[[Any, Any], Player]:
+    """(artifacts, hyper) of one member -> what plays."""
+    source, policy = make_source(config, env), METHODS[config.method].policy
+    if policy is not None:
+        act = make_policy(config, env, policy).act
+        return lambda artifacts, hyper: FlatPlayer(Normaliser(**artifacts["normaliser"]), act, artifacts["policy"])
+    sac = high_level_sac(config, env.observation_size, source)
+    return lambda artifacts, hyper: Agent(
+        normaliser=Normaliser(**artifacts["normaliser"]),
+        source=source,
+        sac=sac,
+        box=hyper["skills.latent_box"],
+        skills=artifacts.get("skills", {}),
+        actor=artifacts["actor"],
+    )
+
+
+def evaluation_key() -> jax.Array:
+    """For starts that no training or evaluation of a run has seen: a key of its own, the same for every member."""
+    return jax.random.key(2**32 - 1)
+
+
+def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
+    """Plays whole episodes with the agents of a finished run.
+
+    Args:
+        run: the run folder.
+        episodes: episodes per member.
+
+    Returns:
+        One dict per member: seed, alpha, and whatever else varies, success (0..1), return, length, episodes.
+
+    Raises:
+        UserError: it is no run folder, or the run has not ended.
+    """
+    trained = load_run(run)
+    members = configs.members(trained.config)
+
+    def play(artifacts: Any, hyper: Any, key: jax.Array) -> Any:
+        agent = trained.agent(artifacts, hyper)
+        return evaluate(trained.env, agent.choose, agent.play, key, episodes, trained.config.skills.horizon)
+
+    program = Population(trained.hyper, trained.config.members_per_program).program(play)
+    result = program(trained.artifacts, trained.hyper, evaluation_key())
+    means = {
+        "success": np.asarray(result.success).mean(axis=-1),
+        "return": np.asarray(result.episode_return).mean(axis=-1),
+        "length": np.asarray(result.length).mean(axis=-1),
+    }
+    return [
+        {**member, **{name: float(value[index]) for name, value in means.items()}, "episodes": episodes}
+        for index, member in enumerate(members)
+    ]

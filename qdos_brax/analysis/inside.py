@@ -1,0 +1,244 @@
+"""A look inside a finished run, for its page: what it takes segments of the data for, and what its skills do."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from sklearn.manifold import TSNE  # type: ignore[import-untyped]
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+import envs
+from envs.render import NoOpenGL, Renderer
+from qdos_brax import config as configs
+from qdos_brax.analysis.film import Player, of_member
+from qdos_brax.analysis.finished import TrainedRun, evaluation_key, load_run
+from qdos_brax.data import formats, quality
+from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.device import DeviceData, to_device
+from qdos_brax.data.segments import window
+from qdos_brax.errors import UserError
+from qdos_brax.files import replacing
+from qdos_brax.methods.build import make_source
+from qdos_brax.runs.folder import RunFolder
+from qdos_brax.skills.vae import Segments
+from qdos_brax.skills.weights import advantage_weights
+
+_SEGMENTS = 600
+_MEMBERS = 3  # looked at: the first seed of each of the first settings
+_GRID = 5  # skills along each of the two main directions of the latents
+_SPREAD = 2.0  # how far the grid reaches along them, in standard deviations
+_BETWEEN = 9  # skills on the way from one to another
+_HELD = 3  # segments' lengths that a skill is held for on the map
+_FRAMES = 6
+_FRAME_HEIGHT = 240
+_SEED = 0  # of the segments looked at, and of t-SNE
+
+Arrays = dict[str, np.ndarray]
+
+
+def look_inside(run: Path) -> None:
+    """Writes inside.npz into the folder of a finished run; what cannot be had (no states, no OpenGL) is left out.
+
+    Its arrays, with m the number of a member that was looked at:
+        members: int[M], their numbers.
+        gain, return, quality: [n], of random segments of the data: units of shortest path to the goal that they gain,
+            undiscounted return, code in ``data.quality.QUALITY``.
+        m/weight: float[n], the weight that each segment had (methods that weigh them).
+        m/latent, m/tsne: float[n, z], float[n, 2], the posterior's means and where t-SNE puts them (methods that infer
+            skills from segments).
+        m/grid, m/between: float[k, T, 2], where the body goes from the task's start with skills along the two main
+            directions of the latents, and with those between two segments' own.
+        m/path, m/left, m/latents: float[T, 2], float[T], float[K, z]: an evaluation episode: where the body was, how
+            far it had to go, and the latent of every decision.
+        m/frames, m/frame_steps: uint8[F, height, width, 3], int[F], the scene at some of its steps.
+        goal, walls: float[2], float[W, 2], the goal, and the centres of the wall cells.
+
+    Args:
+        run: the run folder.
+
+    Raises:
+        UserError: the run has not ended, its data are gone, or the file cannot be written.
+    """
+    trained = load_run(run)
+    # On MuJoCo C whatever the run was on: a few episodes are not worth MJX's compilation.
+    trained = trained._replace(env=envs.make(trained.config.env, physics="mujoco"))
+    sample = _sample(RunFolder.open(run), trained)
+    members = _first_seeds(trained)
+    arrays: Arrays = {"members": np.asarray(members), **_place(trained.env), **_truth(trained, sample)}
+    latents, player = _LatentView(trained, sample), Player(trained)
+    for member in members:
+        found = _weights(trained, member, sample) | latents.of(member) | _episode(trained, player, member)
+        arrays |= {f"{member}/{name}": array for name, array in found.items()}
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
+    with replacing(RunFolder.open(run).inside) as partial:
+        partial.write_bytes(content.getvalue())
+
+
+class _Sample(NamedTuple):
+    """Segments of a run's data.
+
+    Attributes:
+        dataset: the data.
+        data: the same on the device.
+        chosen: int[n], which of all segments.
+        starts: int[n], their first rows.
+    """
+
+    dataset: Dataset
+    data: DeviceData
+    chosen: np.ndarray
+    starts: np.ndarray
+
+
+def _sample(folder: RunFolder, trained: TrainedRun) -> _Sample:
+    """Random segments, the same for every method on the same data."""
+    try:
+        path = Path(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["path"])
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"cannot read from {folder.provenance} which data the run had ({error})") from error
+    dataset = formats.read(path, trained.env)
+    data, _ = to_device(dataset, trained.config.skills.horizon)
+    total = data.starts.shape[0]
+    chosen = np.sort(np.random.default_rng(_SEED).choice(total, min(_SEGMENTS, total), replace=False))
+    return _Sample(dataset, data, chosen, np.asarray(data.starts)[chosen])
+
+
+def _first_seeds(trained: TrainedRun) -> list[int]:
+    """The first member of each setting, some of them."""
+    members = configs.members(trained.config)
+    settings = [tuple(value for key, value in member.items() if key != "seed") for member in members]
+    return sorted({settings.index(setting) for setting in settings})[:_MEMBERS]
+
+
+def _place(env: Any) -> Arrays:
+    cells = np.argwhere(env.layout.grid == 1)
+    return {"goal": np.asarray(env.goal_xy, np.float32), "walls": np.asarray(env.layout.ij_to_xy(cells), np.float32)}
+
+
+# --- Segments --------------------------------------------------------------------------------------------------
+
+
+def _truth(trained: TrainedRun, sample: _Sample) -> Arrays:
+    """What is known of the segments without any learner."""
+    dataset, starts, horizon = sample.dataset, sample.starts, trained.config.skills.horizon
+    found: Arrays = {"return": dataset.rewards[starts[:, None] + np.arange(horizon)].sum(axis=1)}
+    if dataset.qpos is not None:
+        gain = quality.progress(trained.env, dataset, starts, horizon)
+        found["gain"] = np.where(np.isfinite(gain), gain, np.nan).astype(np.float32)
+    if dataset.quality is not None:
+        found["quality"] = dataset.quality[starts]
+    return found
+
+
+def _weights(trained: TrainedRun, member: int, sample: _Sample) -> Arrays:
+    if "advantage" not in trained.artifacts:
+        return {}
+    temperature, clip = (trained.hyper[f"skills.{name}"][member] for name in ("advantage_temperature", "weight_clip"))
+    weights = advantage_weights(trained.artifacts["advantage"][member], temperature, clip)
+    return {"weight": np.asarray(weights)[sample.chosen]}
+
+
+class _LatentView:
+    """Latents of the segments, and what skills along them do; compiled once for all members.
+
+    Args:
+        trained: the run.
+        sample: the segments.
+    """
+
+    def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
+        horizon, data = trained.config.skills.horizon, sample.data
+        starts = jnp.asarray(sample.starts)
+        self._trained = trained
+        self._segments = Segments(*window((data.observations, data.actions), starts, horizon))
+        self._after = data.next_observations[starts + horizon - 1]
+        self._steps = min(_HELD * horizon, trained.env.episode_length)
+        self._posterior = jax.jit(make_source(trained.config, trained.env).posterior)
+        self._play = jax.jit(jax.vmap(self._path, in_axes=(None, None, 0)))
+
+    def of(self, member: int) -> Arrays:
+        """What there is of a member; nothing of methods without skills."""
+        if "skills" not in self._trained.artifacts or self._trained.config.skills.horizon == 1:
+            return {}
+        artifacts, hyper = of_member(self._trained, member)
+        latents = np.asarray(self._posterior(artifacts["skills"], self._segments, self._after).mean)
+        if not np.isfinite(latents).all():  # of a member that was frozen
+            return {}
+        found: Arrays = {"latent": latents}
+        if len(latents) > _GRID:
+            found["tsne"] = _tsne(latents)
+        grid, between = _grid(latents), _between(latents)
+        paths = np.asarray(self._play(artifacts, hyper, np.concatenate([grid, between])), np.float32)
+        return found | {"grid": paths[: len(grid)], "between": paths[len(grid) :]}
+
+    def _path(self, artifacts: Any, hyper: Any, latent: jax.Array) -> jax.Array:
+        """[T + 1, 2], where the body goes from one start with a latent."""
+        env, agent = self._trained.env, self._trained.agent(artifacts, hyper)
+
+        def step(state: Any, _: None) -> tuple[Any, jax.Array]:
+            state = env.step(state, agent.play(state.obs, latent))
+            return state, state.pipeline_state.qpos[:2]
+
+        start = env.reset(evaluation_key())
+        _, path = jax.lax.scan(step, start, None, self._steps)
+        return jnp.concatenate([start.pipeline_state.qpos[None, :2], path])
+
+
+def _tsne(latents: np.ndarray) -> np.ndarray:
+    """float32[n, 2], for the eye."""
+    perplexity = min(30.0, (len(latents) - 1) / 3)
+    with threadpool_limits(1):  # its threads wait for each other at every step, for ever where cores are scarce
+        return np.asarray(TSNE(perplexity=perplexity, init="pca", random_state=_SEED).fit_transform(latents))
+
+
+def _main_directions(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(mean[z], axes[2, z]): the two directions in which latents spread most, as long as their standard deviation."""
+    mean = latents.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(latents - mean, full_matrices=False)
+    return mean, axes[:2] * sizes[:2, None] / np.sqrt(len(latents))
+
+
+def _grid(latents: np.ndarray) -> np.ndarray:
+    """float[_GRID^2, z], row by row."""
+    mean, axes = _main_directions(latents)
+    ticks = np.linspace(-_SPREAD, _SPREAD, _GRID)
+    return np.asarray([mean + np.array([x, y])[: len(axes)] @ axes for y in ticks for x in ticks], np.float32)
+
+
+def _between(latents: np.ndarray) -> np.ndarray:
+    """float[_BETWEEN, z], straight from one segment's latent to another's, far apart along the main direction."""
+    mean, axes = _main_directions(latents)
+    order = np.argsort((latents - mean) @ axes[0])
+    first, last = latents[order[len(order) // 20]], latents[order[-1 - len(order) // 20]]
+    share = np.linspace(0, 1, _BETWEEN)[:, None]
+    return np.asarray((1 - share) * first + share * last, np.float32)
+
+
+# --- An episode ------------------------------------------------------------------------------------------------
+
+
+def _episode(trained: TrainedRun, player: Player, member: int) -> Arrays:
+    states: list[tuple[np.ndarray, np.ndarray]] = []
+    latents: list[np.ndarray] = []
+    for state, latent in player.episode(member):
+        if latent is not None and (len(states) - 1) % trained.config.skills.horizon == 0:
+            latents.append(np.asarray(latent))
+        states.append((np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal_xy"])))
+    qpos = np.stack([q for q, _ in states])
+    left = np.asarray(trained.env.true_distance(qpos), np.float32)
+    found: Arrays = {"path": qpos[:, :2].astype(np.float32), "left": left, "latents": np.stack(latents)}
+    steps = np.unique(np.linspace(0, len(states) - 1, _FRAMES).round().astype(int))
+    try:
+        with Renderer(trained.env, _FRAME_HEIGHT) as renderer:
+            found["frames"] = np.stack([renderer.frame(*states[step]) for step in steps])
+            found["frame_steps"] = steps
+    except NoOpenGL:  # a page without frames is better than none
+        pass
+    return found

@@ -1,0 +1,1 @@
+"""The command line: ``train.py`` and ``python -m qdos_brax``."""

@@ -1,0 +1,187 @@
+"""``python -m qdos_brax data``: make a set, look at a file, check one for a task."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import envs
+from qdos_brax.collection import bodies, recipes
+from qdos_brax.collection.default_set import make_file
+from qdos_brax.data import checks, download, formats, sources
+from qdos_brax.data.dataset import episode_bounds
+from qdos_brax.data.labelling import label
+from qdos_brax.data.quality import QUALITY
+from qdos_brax.data.readers.rows import Rows
+from qdos_brax.errors import UserError
+
+_UNUSABLE = 2  # exit code, as for every error that is the user's to mend
+
+
+def add_parser(commands: Any) -> None:
+    """Adds ``data make | info | check`` to the subparsers ``commands``; sets ``run``."""
+    data = commands.add_parser("data", help="make, look at and check data files")
+    actions = data.add_subparsers(metavar="ACTION", required=True)
+
+    make = actions.add_parser("make", help="collect a set, by OGBench's recipes or a mixture of good and bad behaviour")
+    make.add_argument("task", metavar="TASK", help="the task, as listed by: python -m qdos_brax tasks")
+    make.add_argument("--out", metavar="FILE", required=True, help="the file to write (.hdf5, D4RL's flat layout)")
+    make.add_argument("--transitions", metavar="N", type=int, default=200_000, help="rows (default 200000)")
+    make.add_argument(
+        "--recipe",
+        choices=recipes.NAMES,
+        default="mixed",
+        help="OGBench's navigate, stitch or explore, or a mixture of good and bad behaviour (default mixed)",
+    )
+    make.add_argument(
+        "--mix", metavar="M", help="mixed: share of each behaviour, as expert=0.3,noisy=0.3,wander=0.2,fail=0.2"
+    )
+    make.add_argument(
+        "--degraded-share",
+        metavar="P",
+        type=float,
+        help="mixed: share of degraded episodes, in equal parts (default 0.5)",
+    )
+    make.add_argument(
+        "--noise",
+        metavar="X",
+        type=float,
+        help="action noise of the other episodes (default 0.2; explore: 1, humanoid 0.4)",
+    )
+    make.add_argument("--seed", metavar="S", type=int, default=0, help="seed (default 0)")
+    make.add_argument("--num-envs", metavar="N", type=int, default=64, help="environments at once (default 64)")
+    make.add_argument(
+        "--physics", metavar="ENGINE", default="auto", help="auto, mjx, mjx-warp or mujoco (default auto: mujoco)"
+    )
+    make.set_defaults(run=_make)
+
+    fetch = actions.add_parser("fetch", help="fetch a public set by name, or check one that was fetched")
+    fetch.add_argument("names", metavar="NAME", nargs="+", help=f"such as {sources.examples()}")
+    fetch.set_defaults(run=_fetch)
+
+    what = "an OGBench .npz, a D4RL .hdf5, a Minari folder, or the name of a public set"
+    info = actions.add_parser("info", help="what is in a data file")
+    info.add_argument("file", metavar="FILE", help=what)
+    info.add_argument("--env", metavar="TASK", help="the task for --map (default: the one the file was made for)")
+    info.add_argument("--map", metavar="FILE", help="also draw where the data has been, as .png")
+    info.set_defaults(run=_info)
+
+    check = actions.add_parser("check", help="whether a data file fits a task; exit code 2 if not")
+    check.add_argument("file", metavar="FILE", help=what)
+    check.add_argument("--env", metavar="TASK", required=True, help="the task it shall be used for")
+    check.add_argument("--horizon", metavar="H", type=int, default=20, help="steps of a segment (default 20)")
+    check.add_argument("--map", metavar="FILE", help="also draw where the data has been, as .png")
+    check.set_defaults(run=_check)
+
+
+def _make(args: argparse.Namespace) -> int:
+    from qdos_brax.runs.jax_setup import prepare_jax  # here, for info and check need no learner
+
+    prepare_jax()
+    path = Path(args.out).expanduser()
+    if path.suffix not in (".hdf5", ".h5"):
+        raise UserError(f"--out {args.out}: data is written as .hdf5; give the file that ending")
+    env = _env(args.task, args.physics)
+    make_file(path, env, args.transitions, _recipe(args, env), args.seed, args.num_envs)
+    print(path)
+    return 0
+
+
+def _recipe(args: argparse.Namespace, env: envs.TaskEnv) -> recipes.Recipe:
+    body = bodies.conduct_of(env)
+    if args.recipe != "mixed":
+        if args.mix is not None or args.degraded_share is not None:
+            raise UserError(f"--recipe {args.recipe} takes neither --mix nor --degraded-share; mixed does")
+        return recipes.named(args.recipe, body, args.noise)
+    noise = recipes.NOISE if args.noise is None else args.noise
+    if args.mix is None:
+        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, body, noise)
+    if args.degraded_share is not None:
+        raise UserError("--mix and --degraded-share both say what is mixed; give one of them")
+    return recipes.mixed(recipes.parse_mix(args.mix), body, noise)
+
+
+def _fetch(args: argparse.Namespace) -> int:
+    for name in args.names:
+        if sources.find(name) is None:
+            raise UserError(f"there is no public data set {name!r}; there are such as {sources.examples()}")
+    for name in args.names:
+        print(download.resolve(name))
+    return 0
+
+
+def _info(args: argparse.Namespace) -> int:
+    path = download.resolve(args.file)
+    rows, attributes = formats.load(path), formats.read_attrs(path)
+    for name, value in attributes.items():
+        print(f"{name:18s} {value}")
+    for name, array in rows.arrays().items():
+        print(f"{name:18s} {array.dtype} {'x'.join(map(str, array.shape))}")
+    print(f"{'transitions':18s} {rows.size:,}")
+    if rows.size:
+        _describe(rows)
+    for line in rows.notes:
+        print(f"note: {line}")
+    if args.map:
+        task = args.env or attributes.get("env")
+        if not task:
+            raise UserError(f"{path} does not say which task it was made for; name it with --env")
+        _draw_map(args.map, rows, _env(str(task), "mujoco"), path.name)
+    return 0
+
+
+def _describe(rows: Rows) -> None:
+    """Episodes, returns, actions and behaviour of a set that is not empty."""
+    bounds = episode_bounds(rows.ends)
+    lengths = bounds[:, 1] - bounds[:, 0]
+    print(f"{'episodes':18s} {len(lengths):,} of {lengths.min()} to {lengths.max()} steps")
+    if rows.rewards is not None:
+        returns = np.add.reduceat(rows.rewards, bounds[:, 0])
+        spread = f"{returns.min():.4g} to {returns.max():.4g}, mean {returns.mean():.4g}"
+        print(f"{'returns':18s} {spread} (the file's own rewards, undiscounted)")
+    print(f"{'largest action':18s} {np.abs(rows.actions).max():.4g}")
+    if rows.quality is not None:
+        shares = ", ".join(f"{name} {np.mean(rows.quality == code):.1%}" for name, code in QUALITY.items())
+        print(f"{'behaviour':18s} {shares}")
+
+
+def _check(args: argparse.Namespace) -> int:
+    if args.horizon < 1:
+        raise UserError(f"--horizon must be at least 1, got {args.horizon}")
+    env = _env(args.env, "mujoco")
+    path = download.resolve(args.file)
+    rows = formats.load(path)
+    found = checks.inspect(rows, env, args.horizon, formats.read_attrs(path))
+    for line in found.errors:
+        print(f"error: {line}")
+    for line in found.notes:
+        print(f"note: {line}")
+    if args.map:
+        _draw_map(args.map, rows, env, path.name)
+    if found.errors:
+        return _UNUSABLE
+    dataset = label(rows, env, str(path))
+    episodes = dataset.episode_bounds
+    reached = sum(1 for first, stop in episodes if (dataset.masks[first:stop] == 0).any())
+    print(f"{args.file} fits {env.spec.full_name}: {dataset.size:,} transitions, {len(episodes):,} episodes")
+    print(f"{reached:,} episodes reach the goal; {np.mean(dataset.masks == 0):.2%} of the rows are at it")
+    return 0
+
+
+def _draw_map(out: str, rows: Rows, env: envs.TaskEnv, title: str) -> None:
+    from qdos_brax.report.coverage import draw_coverage  # here, for matplotlib takes a while
+
+    if rows.qpos is None or rows.qpos.shape[1:] != (env.engine.nq,):
+        raise UserError(f"a map needs the simulator states (qpos) of {env.spec.name}, which this file does not hold")
+    draw_coverage(rows.qpos, env, Path(out), f"{title}, {env.spec.full_name}")
+    print(out)
+
+
+def _env(name: str, physics: str) -> envs.TaskEnv:
+    try:
+        return envs.make(name, physics=physics)
+    except ValueError as error:  # envs knows nothing of UserError; its lines are made for the user all the same
+        raise UserError(str(error)) from None

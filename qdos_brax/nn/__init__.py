@@ -1,0 +1,1 @@
+"""Networks, distributions and the optimiser step: no losses, no data."""

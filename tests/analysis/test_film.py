@@ -1,0 +1,147 @@
+"""Films and pictures: of a finished run with untrained networks, which is as good as any for a film."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import jax
+import matplotlib.image
+import numpy as np
+import pytest
+
+from envs import render
+from qdos_brax.analysis import film
+from qdos_brax.analysis import finished as finished_runs
+from qdos_brax.commands import cli
+from qdos_brax.errors import UserError
+from qdos_brax.report.video import mp4
+
+CAP = 25
+
+
+def main(command: str) -> int:
+    try:
+        return cli.main(shlex.split(command))
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+def read(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[dict, np.ndarray]:
+    """What ffmpeg says of a film, and its frames uint8[T, height, width, 3]."""
+    # Without this it runs Python between fork and exec, where JAX's threads can hang it.
+    monkeypatch.setenv("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
+    reader = imageio_ffmpeg.read_frames(path)
+    about = next(reader)
+    width, height = about["size"]
+    return about, np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader])
+
+
+@pytest.mark.usefixtures("opengl")
+def test_evaluate_films_the_first_episode(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    frame = render.Renderer.frame
+    monkeypatch.setattr(render.Renderer, "frame", lambda self, *state: drawn.append(state) or frame(self, *state))
+    out = tmp_path / "film.mp4"
+    assert main(f"evaluate {finished} --episodes 2 --video {out}") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{out}: success 0, return -{CAP}, length {CAP}"
+    assert len(lines) == 3 and f"return -{CAP}, length {CAP}, episodes 2" in lines[1]
+    about, frames = read(out, monkeypatch)
+    assert about["codec"] == "h264" and about["fps"] == 10.0  # 0.1 s per control step
+    assert frames.shape == (CAP + 1, 480, 480, 3)
+    assert (frames[:, :20, :20] > 200).all()  # the wall in the corner
+    assert (frames[0] != frames[-1]).any()
+    assert sorted(tmp_path.iterdir()) == [out, finished]
+
+    # The states drawn are an episode of the first member's agent, played here as macro steps play it.
+    trained = finished_runs.load_run(finished)
+    agent = trained.agent(*jax.tree.map(lambda x: x[0], (trained.artifacts, trained.hyper)))
+    state = trained.env.reset(jax.random.split(finished_runs.evaluation_key(), 2)[0])
+    step = jax.jit(lambda state, latent: trained.env.step(state, agent.play(state.obs, latent)))
+    for t in range(11):
+        np.testing.assert_allclose(drawn[t][0], state.pipeline_state.qpos, atol=1e-3)
+        np.testing.assert_array_equal(drawn[t][1], trained.env.goal_xy)
+        if t % 10 == 0:
+            latent = agent.choose(state.obs)
+        state = step(state, latent)
+
+
+def test_the_evaluation_is_the_same_without_a_film(finished: Path) -> None:
+    members = finished_runs.evaluate_run(finished, 2)
+    assert [member["seed"] for member in members] == [0, 1]
+    assert all((member["return"], member["length"], member["success"]) == (-CAP, CAP, 0) for member in members)
+
+
+@pytest.mark.parametrize("height", [48, 51])
+def test_frames_are_what_was_written(tmp_path: Path, height: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    with mp4(tmp_path / "a.mp4", height, 64, 25) as write:
+        for level in (0, 120, 250):
+            write(np.full((height, 64, 3), level, np.uint8))
+    about, frames = read(tmp_path / "a.mp4", monkeypatch)
+    assert about["fps"] == 25 and len(frames) == 3
+    assert frames.shape[1:] == (height - height % 2, 64, 3)
+    np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)), [0, 120, 250], atol=4)
+
+
+def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    out = tmp_path / "a.mp4"
+    out.write_text("earlier")
+    with pytest.raises(ZeroDivisionError), mp4(out, 16, 16, 10) as write:
+        write(np.zeros((16, 16, 3), np.uint8))
+        raise ZeroDivisionError
+    assert out.read_text() == "earlier" and list(tmp_path.iterdir()) == [out]
+
+
+def test_what_is_wrong_with_a_film_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(UserError, match=r"written as \.mp4, not as a\.gif"), mp4(tmp_path / "a.gif", 16, 16, 10):
+        pass
+    with pytest.raises(UserError, match=r"cannot write .*No such file"), mp4(tmp_path / "no" / "a.mp4", 16, 16, 10):
+        pass
+    with (
+        pytest.raises(UserError, match=r"cannot write .*a\.mp4: ffmpeg says"),
+        mp4(tmp_path / "a.mp4", 0, 0, 10) as write,
+    ):
+        for _ in range(9):
+            write(np.zeros((200, 200, 3), np.uint8))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(UserError, match=r"pip install -c constraints.txt -e \"\.\[video\]\""):
+        mp4(tmp_path / "a.mp4", 16, 16, 10).__enter__()
+    assert main("evaluate a b --video c.mp4") == 2
+    assert capsys.readouterr().err == "error: --video films one run, and 2 were given; name one RUN\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_opengl_a_film_is_one_line(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(UserError, match="cannot draw: MUJOCO_GL is 'off'"):
+        film.film_run(finished, tmp_path / "a.mp4")
+    assert not (tmp_path / "a.mp4").exists()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_picture_of_a_task(tmp_path: Path) -> None:
+    out = tmp_path / "maze.png"
+    assert main(f"picture antmaze-large --out {out}") == 0
+    image = matplotlib.image.imread(out)
+    assert image.shape[:2] == (720, 960)
+    red = (image[..., 0] > 0.8) & (image[..., 2] < 0.65) & (image[..., 1] < 0.65)
+    row, column = np.argwhere(red).mean(axis=0)
+    assert row < 240 and column > 720  # task 1's goal lies in the upper right corner
+
+
+def test_wrong_pictures_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for command, message in (
+        ("picture antmaze-larg --out a.png", "did you mean 'antmaze-large'"),
+        ("picture antmaze --out a.jpg", "written as .png"),
+        ("picture antmaze", "--out"),
+    ):
+        assert main(command) == 2
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1 and message in lines[0]

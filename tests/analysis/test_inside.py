@@ -1,0 +1,146 @@
+"""A look inside a finished run: numbers of a data set made by hand, skills from one start, and the page."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import render
+from qdos_brax.analysis import finished as finished_runs
+from qdos_brax.analysis import inside
+from qdos_brax.data.dataset import Dataset
+from qdos_brax.errors import UserError
+from qdos_brax.report.inside_sections import inside_sections
+from qdos_brax.report.looks import read_looks
+from qdos_brax.report.page import write_page
+from qdos_brax.report.study import read_study
+
+CAP, HORIZON, SIZE = 25, 10, 60
+
+
+@pytest.fixture
+def data() -> Dataset:
+    """Three episodes of 20 steps; in each the body goes a tenth of a unit per step along the first corridor."""
+    rng = np.random.default_rng(0)
+    qpos = np.zeros((SIZE, 15), np.float32)
+    qpos[:, 0] = np.tile(np.arange(20) / 10, 3)
+    qpos[:, 3] = 1.0
+    ends = np.arange(SIZE) % 20 == 19
+    observations = rng.normal(size=(SIZE, 29)).astype(np.float32)
+    return Dataset(
+        observations=observations,
+        actions=rng.uniform(-1, 1, (SIZE, 8)).astype(np.float32),
+        rewards=-np.ones(SIZE, np.float32),
+        masks=np.ones(SIZE, np.float32),
+        ends=ends,
+        next_observations=observations,
+        qpos=qpos,
+        qvel=np.zeros((SIZE, 14), np.float32),
+        quality=(np.arange(SIZE) // 20).astype(np.int8),
+    )
+
+
+@pytest.fixture
+def looked(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run that was looked into; its second segment is worth ten times as much as the others."""
+    (finished / "run.json").write_text(json.dumps({"dataset": {"path": "data.hdf5", "sha256": "d" * 64}}))
+    monkeypatch.setattr(inside.formats, "read", lambda path, env: data)
+    monkeypatch.setattr(inside, "_FRAME_HEIGHT", 48)
+    load = finished_runs.load_run
+    advantage = jnp.zeros((2, 33)).at[:, 1].set(math.log(10))
+    monkeypatch.setattr(
+        inside, "load_run", lambda run: load(run)._replace(artifacts=load(run).artifacts | {"advantage": advantage})
+    )
+    inside.look_inside(finished)
+    return finished
+
+
+@pytest.mark.slow
+def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
+    with np.load(looked / "inside.npz", allow_pickle=False) as file:
+        found = dict(file)
+    assert found["members"].tolist() == [0]  # the other has the same setting and another seed
+    segments = 3 * (20 - HORIZON + 1)
+    np.testing.assert_array_equal(found["return"], np.full(segments, -HORIZON))
+    # Segment 0 goes from x = 0 to 1; the last of each episode from 1 to 1.9, where the log ends.
+    places = np.zeros((3, 15))
+    places[:, 0] = 0, 1, 1.9
+    left = envs.make("antmaze-medium", physics="mujoco").true_distance(places)
+    expected = [left[0] - left[1], *[left[1] - left[2]] * 3]
+    np.testing.assert_allclose(found["gain"][[0, 10, 21, 32]], expected, atol=1e-4)
+    assert found["quality"].tolist() == [0] * 11 + [1] * 11 + [2] * 11
+    mean = (segments - 1 + 10) / segments
+    np.testing.assert_allclose(found["0/weight"], [(10 if i == 1 else 1) / mean for i in range(segments)], rtol=1e-5)
+    assert found["0/latent"].shape == (segments, 8) and found["0/tsne"].shape == (segments, 2)
+    for name, count in (("grid", 25), ("between", 9)):
+        paths = found[f"0/{name}"]
+        assert paths.shape == (count, CAP + 1, 2) and np.ptp(paths[:, 0], axis=0).max() == 0
+        assert np.ptp(paths[:, -1], axis=0).max() > 0  # not all skills lead to one place
+    assert found["0/path"].shape == (CAP + 1, 2) and found["0/latents"].shape == (3, 8)
+    env = envs.make("antmaze-medium", physics="mujoco")
+    start = np.zeros(15)
+    start[:2] = found["0/path"][0]
+    assert found["0/left"][0] == pytest.approx(float(env.true_distance(start)), rel=1e-5)
+    if opengl_or_not:
+        assert found["0/frames"].shape == (6, 48, 48, 3) and found["0/frame_steps"].tolist() == [0, 5, 10, 15, 20, 25]
+
+    written_as_finished(looked)
+    study = read_study([looked])
+    looks, _ = read_looks(study)
+    sections = {section.title: section for section in inside_sections(looks)}
+    titles = ["Weight against quality", "Latents of segments (t-SNE)", "Where skills lead", "Skills over an episode"]
+    assert list(sections) == titles
+    dots = sections["Weight against quality"].figures[0].data
+    assert [trace["name"] for trace in dots] == ["good", "noisy", "wandering"]
+    assert dots[0]["y"][1] == pytest.approx(10 / mean, rel=1e-4)
+    assert len(sections["Where skills lead"].figures[0].data) == 25 + 1
+    assert len(sections["Skills over an episode"].inner[0].images) == (6 if opengl_or_not else 0)
+    write_page(study, looks, looked / "report.html")
+    assert (looked / "report.html").read_text().count("data:image/jpeg;base64,") == (6 if opengl_or_not else 0)
+
+    (looked / "inside.npz").write_bytes((looked / "inside.npz").read_bytes()[:1000])
+    assert read_looks(study)[0] == [] and "remove it" in read_looks(study)[1][0]
+
+
+@pytest.fixture
+def opengl_or_not() -> bool:
+    try:
+        render.Renderer(envs.make("antmaze-medium", physics="mujoco"), 16, 16).close()
+    except render.NoOpenGL:
+        return False
+    return True
+
+
+@pytest.mark.slow
+def test_without_provenance_it_is_one_line(finished: Path) -> None:
+    with pytest.raises(UserError, match="which data the run had"):
+        inside.look_inside(finished)
+
+
+def test_grid_and_way_between_by_hand() -> None:
+    """Latents on a cross: three long along the second axis, one along the first."""
+    latents = np.asarray([[1, 0, 0], [-1, 0, 0], [0, 3, 0], [0, -3, 0]], np.float32)
+    grid = inside._grid(latents).reshape(5, 5, 3)
+    np.testing.assert_allclose(grid[2, 2], 0, atol=1e-6)
+    deviation = 3 / np.sqrt(2)  # of two at +-3 and two at 0
+    np.testing.assert_allclose(np.abs(grid[2, 4]), [0, 2 * deviation, 0], atol=1e-5)
+    np.testing.assert_allclose(np.abs(grid[4, 2]), [2 / np.sqrt(2), 0, 0], atol=1e-5)
+    between = inside._between(latents)
+    np.testing.assert_allclose(np.abs(between[[0, 4, -1]]), [[0, 3, 0], [0, 0, 0], [0, 3, 0]], atol=1e-5)
+    np.testing.assert_allclose(between[0], -between[-1], atol=1e-5)
+
+
+def written_as_finished(run: Path) -> None:
+    """Gives the run what a report reads beside: a summary and a row per member."""
+    entry = {"alpha": 0.2, "eval_success": 0.0, "first_goal_step": None, "status": "ok"}
+    members = [{"seed": seed, **entry} for seed in (0, 1)]
+    header = {"env": "antmaze-medium-task1", "method": "qdos", "wall_seconds": {"online": 1.0}}
+    (run / "summary.json").write_text(json.dumps({**header, "members": members}))
+    rows = [f"{i},{i},0.2,online,100,10,0.0" for i in (0, 1)]
+    (run / "metrics.csv").write_text("\n".join(["member,seed,alpha,phase,env_steps,update,eval/success", *rows]) + "\n")

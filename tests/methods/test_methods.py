@@ -1,0 +1,323 @@
+"""Every method is a recipe that builds; flat methods learn, guide, go on after a crash, and are evaluated."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qdos_brax import config as configs
+from qdos_brax.analysis.finished import evaluate_run
+from qdos_brax.commands.cli import train_main
+from qdos_brax.config.methods import METHODS
+from qdos_brax.config.methods import settings as recipe_settings
+from qdos_brax.errors import UserError
+from qdos_brax.high_level.jump_start import JumpStart
+from qdos_brax.high_level.sac import SAC
+from qdos_brax.methods.build import build_phases
+from qdos_brax.nn.networks import gaussian_log_prob
+from qdos_brax.population.members import Population
+from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.loop import run_phases
+from qdos_brax.skills.latent_map import Prior, latent_map
+from qdos_brax.skills.source import ActionSource, DirectionSource, TransitionSource
+from qdos_brax.skills.vae import Segments
+from tests.point import GOAL, STEP, TOLERANCE, PointEnv, point_config, point_dataset
+
+PHASES = {
+    "qdos": ["values", "skills", "label", "online"],
+    "supe": ["skills", "label", "online"],
+    "trajectory-skills": ["skills", "online"],
+    "explore": ["label", "online"],
+    "rlpd": ["label", "online"],
+    "hilp": ["skills", "label", "online"],
+    "hilp-online": ["skills", "online"],
+    "diffusion-jsrl": ["guide", "online"],
+    "iql": ["policy"],
+    "bc": ["policy"],
+    "diveoff": ["skills", "label", "online"],
+}
+
+
+def config_of(method: str, **values: Any) -> configs.Config:
+    """The plane's configuration for a method."""
+    horizon = recipe_settings(method, "antmaze").get("skills.horizon", 5)
+    return point_config(**{"method": method, "skills.horizon": horizon, "values.n_step": horizon} | values)
+
+
+def phases_of(config: configs.Config, dataset: Any) -> list[Any]:
+    return build_phases(config, PointEnv(), dataset, Population(configs.population_hyper(config)))
+
+
+def test_every_method_of_the_issue_is_there() -> None:
+    assert set(METHODS) == set(PHASES)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_recipe_builds_its_phases(method: str) -> None:
+    phases = phases_of(config_of(method), point_dataset(20))
+    assert [phase.name for phase in phases] == PHASES[method]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("family", configs.families())
+def test_every_recipe_has_values_for_every_family(method: str, family: str) -> None:
+    """Published values are those of the configuration, and stand below the preset and ``--set``."""
+    published = recipe_settings(method, family)
+    config = configs.load_config(family, "paper", {"method": method})
+    for key, value in published.items():
+        found = configs.schema.get(config, key)
+        assert found == (tuple(value) if isinstance(value, list) else value), key
+    own = configs.load_config(family, "paper", {"method": method}, ["labels.rnd_coefficient=3"])
+    assert own.labels.rnd_coefficient == 3.0
+
+
+def test_published_values() -> None:
+    maze = {method: configs.load_config("antmaze-large", "paper", {"method": method}) for method in METHODS}
+    assert maze["supe"].labels.offline_reward == maze["explore"].labels.offline_reward == "min"
+    assert maze["qdos"].labels.offline_reward == maze["rlpd"].labels.offline_reward == "data"
+    assert (maze["explore"].labels.rnd_coefficient, maze["rlpd"].labels.rnd_coefficient) == (2.0, 0.0)
+    assert maze["trajectory-skills"].high_level.offline_fraction == 0.0
+    assert (maze["diffusion-jsrl"].guide.ratio, maze["iql"].policy.inverse_temperature) == (0.9, 10.0)
+    kitchen = {method: configs.load_config("kitchen-mixed", "paper", {"method": method}) for method in METHODS}
+    assert kitchen["supe"].labels.offline_reward == kitchen["hilp"].labels.offline_reward == "pred"
+    assert (kitchen["diffusion-jsrl"].guide.ratio, kitchen["iql"].values.expectile) == (0.75, 0.7)
+
+
+def test_a_flat_method_refuses_skills() -> None:
+    with pytest.raises(UserError, match=r"rlpd has no skills.*horizon must stay 1, not 5"):
+        phases_of(config_of("rlpd", **{"skills.horizon": 5}), point_dataset(20))
+
+
+# --- The flat learner, on a task whose optimum is known ------------------------------------------------------
+
+
+def fewest_steps(start: np.ndarray) -> int:
+    """Steps from ``start`` until the task is over: each coordinate moves at most STEP, success is read a step later."""
+    for moves in range(100):
+        gap = np.maximum(np.abs(GOAL - start) - moves * STEP, 0)
+        if np.linalg.norm(gap) <= TOLERANCE:
+            return moves + 1
+    raise AssertionError
+
+
+def test_rlpd_reaches_the_optimum_of_the_plane() -> None:
+    config = config_of(
+        "rlpd",
+        **{
+            "high_level.env_steps": 2_000,
+            "high_level.utd": 4,
+            "high_level.learning_rate": 1e-3,
+            "high_level.target_rate": 0.02,
+            "high_level.warmup_env_steps": 200,
+            "eval.episodes": 50,
+            "eval.every_env_steps": 2_000,
+        },
+    )
+    artifacts: dict[str, Any] = {}
+    for phase in phases_of(config, point_dataset()):
+        state = phase.init(jax.random.split(jax.random.key(0), 1), artifacts)
+        for _ in range(phase.num_chunks):
+            state, metrics = phase.chunk(state)
+        artifacts = phase.finish(state, artifacts)
+    starts = 0.1 * np.random.default_rng(0).normal(size=(1000, 2))
+    best = np.mean([fewest_steps(start) for start in starts])
+    assert 8 < best < 10
+    assert metrics["eval/success"][0] == 1.0
+    assert metrics["eval/length"][0] < best + 1.0
+
+
+# --- The guide -------------------------------------------------------------------------------------------------
+
+
+def test_the_guides_steps_are_geometric() -> None:
+    """P(0) = 1 - ratio, P(n) = ratio (1 - p) p^(n - 1): each within five standard errors."""
+    ratio, persistence, episodes = 0.75, 0.9, 100_000
+    steps = np.asarray(JumpStart(lambda *_: None, ratio, persistence).draw(jax.random.key(0), episodes))
+    for n in range(12):
+        expected = 1 - ratio if n == 0 else ratio * (1 - persistence) * persistence ** (n - 1)
+        error = np.sqrt(expected * (1 - expected) / episodes)
+        assert abs(np.mean(steps == n) - expected) < 5 * error, n
+    assert abs(steps.mean() - ratio / (1 - persistence)) < 0.2
+
+
+def test_the_guide_acts_first_and_only_so_long() -> None:
+    """What is stored is the guide's action for the drawn number of steps, and the actor's after."""
+    config = config_of("diffusion-jsrl", **{"high_level.warmup_env_steps": 0})
+    phase = phases_of(config, point_dataset(20))[-1]
+    phase._guide.sample = lambda params, key, observation: jnp.full((observation.shape[0], 2), 0.123)
+    state = phase.init(jax.random.split(jax.random.key(0), 1), {"guide": {"x": jnp.zeros(1)}})
+    state = jax.tree.map(lambda x: x[0], state).replace(guided=jnp.array([3, 0]))
+    hyper = {key: value[0] for key, value in phase._hyper.items()}
+    act = jax.jit(phase._act)
+    for n in range(5):
+        state, _, _ = act(state, jax.random.key(n), {"skills": {}, "guide": {}}, hyper)
+    actions = np.asarray(state.replay.data.action[:10]).reshape(5, 2, 2)
+    guided = (np.abs(actions - 0.123) < 1e-6).all(axis=-1)
+    np.testing.assert_array_equal(guided, [[True, False]] * 3 + [[False, False]] * 2)
+
+
+# --- Bonus and regulariser -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", ["all", "online"])
+def test_the_bonus_is_on_the_rows_it_is_asked_for(rows: str) -> None:
+    config = config_of("explore", **{"labels.bonus_rows": rows, "labels.offline_reward": "data"})
+    data = point_dataset(20)
+    phase = phases_of(config, data)[-1]
+    labels = {"labels": jnp.zeros((1, data.size, 2)), "skills": {}}
+    state = jax.tree.map(lambda x: x[0], phase.init(jax.random.split(jax.random.key(0), 1), labels))
+    frozen = {"skills": {}, "labels": labels["labels"][0]}
+    hyper = {key: value[0] for key, value in phase._hyper.items()}
+    state, _, _ = jax.jit(phase._act)(state, jax.random.key(1), frozen, hyper)
+    batch = phase._sample(state.learners, state.replay, jax.random.key(2), frozen=frozen, hyper=hyper, data=phase._data)
+    offline, online = np.split(np.asarray(batch.reward), 2)
+    assert (online > -1).all()  # each earned -1 and a bonus
+    assert np.isin(offline, [-1.0, 0.0]).all() == (rows == "online")
+
+
+def test_divergence_from_the_skill_prior_by_hand() -> None:
+    """An untrained actor of zeros is N(0, 1) before the squashing: KL 0 from that prior, d / 2 from N(1, 1)."""
+    sac = SAC(2, 3, (8,), 2, 1)
+    state = sac.init(jax.random.key(0), 1.0)
+    actor = jax.tree.map(jnp.zeros_like, state.actor)
+    mapping, observation = latent_map("arctanh", 1.0), jnp.zeros((20_000, 2))
+    for mean, divergence in ((0.0, 0.0), (1.0, 1.5)):
+        prior = Prior(jnp.full(3, mean), jnp.zeros(3))
+
+        def log_prior(observation: jax.Array, action: jax.Array, prior: Prior = prior) -> jax.Array:
+            return gaussian_log_prob(mapping.to_latent(action, prior), *prior) + mapping.log_jacobian(action, prior)
+
+        _, entropy = sac.actor_loss(actor, state.critic, jnp.ones(()), observation, jax.random.key(1), log_prior)
+        np.testing.assert_allclose(entropy, -divergence, atol=0.06)
+
+
+# --- Going on after a crash ------------------------------------------------------------------------------------
+
+
+class Crash(Exception):
+    """What a phase dies of."""
+
+
+def crash_at_the_second(chunk: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """``chunk``, which raises when it is called again."""
+    calls = itertools.count()
+
+    def crashing(state: Any) -> Any:
+        if next(calls):
+            raise Crash
+        return chunk(state)
+
+    return crashing
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["diffusion-jsrl", "explore", "iql"])
+def test_a_crashed_run_ends_as_if_nothing_had_happened(method: str, tmp_path: Path) -> None:
+    config = config_of(method, **{"labels.start_env_steps": 40, "policy.every_updates": 20, "guide.updates": 20})
+
+    phases = phases_of(config, point_dataset(20))  # once: what they carry over is what ``init`` sets
+    whole_chunk = phases[-1].chunk
+
+    def run(path: Path, crash: bool) -> list[dict[str, str]]:
+        phases[-1].chunk = crash_at_the_second(whole_chunk) if crash else whole_chunk
+        folder = RunFolder.open(str(path)) if path.exists() else RunFolder.create(str(path))
+        folder.config.write_text(configs.to_yaml(config))
+        with folder.held():
+            run_phases(
+                phases,
+                folder,
+                configs.members(config),
+                config=configs.config_hash(config),
+                header={},
+                checkpoint_seconds=0,
+            )
+        with folder.metrics.open(newline="") as file:
+            return [{name: cell for name, cell in row.items() if name != "sps"} for row in csv.DictReader(file)]
+
+    undisturbed = run(tmp_path / "whole", crash=False)
+    assert undisturbed[-1]["eval/success"]
+    with pytest.raises(Crash):
+        run(tmp_path / "crashed", crash=True)
+    assert run(tmp_path / "crashed", crash=False) == undisturbed
+
+
+# --- Sources ---------------------------------------------------------------------------------------------------
+
+
+def segments() -> tuple[Segments, jax.Array]:
+    keys = jax.random.split(jax.random.key(0), 3)
+    observations = jax.random.normal(keys[0], (4, 3, 2))
+    actions = jax.random.uniform(keys[1], (4, 3, 2), minval=-1.0)
+    return Segments(observations, actions), jax.random.normal(keys[2], (4, 2))
+
+
+def test_an_action_is_its_own_label() -> None:
+    source, (batch, after) = ActionSource(2), segments()
+    mean, log_std = source.posterior({}, batch, after)
+    np.testing.assert_array_equal(mean + jnp.exp(log_std), batch.actions[:, 0])
+    action = source.to_action({}, mean, after, 2.0)
+    np.testing.assert_array_equal(source.act({}, after, source.to_latent({}, action, after, 2.0)), mean)
+
+
+def test_a_direction_is_that_from_first_to_last_state() -> None:
+    source = DirectionSource(
+        2, lambda p, a, b: (b - a) / jnp.linalg.norm(b - a, axis=-1, keepdims=True), lambda p, o, z: z
+    )
+    batch, after = segments()
+    way = after - batch.observations[:, 0]
+    latent = source.posterior({}, batch, after).mean
+    np.testing.assert_allclose(latent, way / np.linalg.norm(way, axis=-1, keepdims=True), rtol=1e-5)
+    action = source.to_action({}, 0.3 * latent, after, 2.0)  # every u that points there plays it
+    np.testing.assert_allclose(source.to_latent({}, action, after, 2.0), latent, rtol=1e-5)
+
+
+def test_a_segments_latent_is_the_mean_over_its_transitions() -> None:
+    class Model:
+        latent_dim = 2
+
+        def prior(self, params: Any, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jnp.zeros_like(observation), jnp.zeros_like(observation)
+
+        def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+            return latent
+
+    source = TransitionSource(Model(), lambda p, o, a: (o + a, jnp.full_like(a, jnp.log(0.3))), "box")
+    batch, after = segments()
+    mean, log_std = source.posterior({}, batch, after)
+    np.testing.assert_allclose(mean, (batch.observations + batch.actions).mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(jnp.exp(log_std), 0.3 / np.sqrt(3), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["arctanh", "box", "prior"])
+def test_the_priors_density_over_actions_has_mass_one(name: str) -> None:
+    """What a map changes of the density is its Jacobian: integrated over (-1, 1), what is left inside is left."""
+    prior = Prior(jnp.array([0.2]), jnp.array([-1.0]))
+    mapping = latent_map(name, 2.0)
+    u = jnp.linspace(-1, 1, 200_001)[1:-1, None]
+    density = jnp.exp(gaussian_log_prob(mapping.to_latent(u, prior), *prior) + mapping.log_jacobian(u, prior))
+    inside = {"arctanh": 1.0, "box": 1.0, "prior": 0.9545}[name]  # two standard deviations
+    np.testing.assert_allclose(jnp.trapezoid(density, u[:, 0]), inside, atol=1e-3)
+
+
+# --- The real program ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_runs_by_name_and_is_evaluated(method: str, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert train_main(["--env", "antmaze-medium", "--preset", "smoke", "--method", method, "--out", str(out)]) == 0
+    (member,) = json.loads((out / "summary.json").read_text())["members"]
+    assert member["status"] == "ok" and member["eval_episodes"] == 2
+    (played,) = evaluate_run(out, 1)
+    assert played["return"] >= -1000

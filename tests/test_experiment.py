@@ -1,0 +1,37 @@
+"""The main command from flags to page, at sizes that prove nothing but that all parts fit together."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+
+from qdos_brax.commands.cli import train_main
+
+TINY = (
+    "--env antmaze-medium --preset smoke --pretrain-steps 2 --steps 160 --set data.transitions=1000 "
+    "--set data.num_envs=4 --set labels.start_env_steps=80 --set high_level.warmup_env_steps=80 "
+    "--set eval.every_env_steps=160 --set eval.episodes=1"
+)
+
+
+def test_a_scan_of_two_from_flags_to_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("QDOS_DATA", str(tmp_path / "data"))
+    run = tmp_path / "run"
+    assert train_main(shlex.split(f"{TINY} --alpha 0.1,0.3 --seed 0,1 --zip --out {run}")) == 0
+    said = capsys.readouterr().out
+    assert "members   2 members, " in said and "done in" in said
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    assert [(member["seed"], member["alpha"]) for member in summary["members"]] == [(0, 0.1), (1, 0.3)]
+    assert all(member["status"] == "ok" and member["env_steps"] == 160 for member in summary["members"])
+    with (run / "metrics.csv").open(newline="") as file:
+        phases = {row["phase"] for row in csv.DictReader(file)}
+    assert phases == {"values", "skills", "label", "online"}
+    assert (run / "report.html").stat().st_size > 0 and any((run / "tensorboard").rglob("events*"))
+    assert train_main(["--resume", str(run)]) == 0  # it has ended: said, not done again
+    assert "has ended already" in capsys.readouterr().out
