@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from qdos_brax.high_level.sac import Params
 from qdos_brax.nn.networks import MLP, Ensemble
-from qdos_brax.nn.optim import ADAM, adam_step, polyak
+from qdos_brax.nn.optim import ADAM, Params, adam_step, polyak
 
 
 class ValueBatch(NamedTuple):
