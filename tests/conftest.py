@@ -18,6 +18,16 @@ from qdos_brax.runs.checkpoint import CheckpointStore, Position
 from qdos_brax.runs.folder import RunFolder
 
 
+# As every run has it (``qdos_brax.runs.jax_setup``): programs that call MuJoCo C can wait for ever on arrays that wait
+# for them if they are dispatched asynchronously.
+jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests of whole runs first: they are the longest, and none must be left alone at the end."""
+    items.sort(key=lambda item: item.path.parent.name not in ("tests", "runs"))
+
+
 @pytest.fixture
 def opengl() -> None:
     """Skips where there is no OpenGL, with the line that a user would see."""
