@@ -66,7 +66,7 @@ def test_page_in_a_browser(page: Path) -> None:
         _hover(window)
         _filter(window)
         _switch_colours(window)
-        assert window.said() == []
+        assert window.console() == []
         requested = window.requested()
         assert requested and {address[:5] for address in requested} <= {"file:", "data:", "blob:"}
 
@@ -79,14 +79,14 @@ def test_nothing_hangs_over_the_edge(page: Path, width: int, part: str) -> None:
         _walk(window)
         wide = f"return [{part}].filter(x => x.scrollWidth > x.clientWidth + 1).length"
         assert window.run(wide) == 0
-        assert window.run("return innerWidth") == width and window.said() == []
+        assert window.run("return innerWidth") == width and window.console() == []
 
 
 def test_an_error_or_a_request_would_be_seen(tmp_path: Path) -> None:
     (tmp_path / "wrong.html").write_text("<img src='http://127.0.0.1:9/x.png'><script>nonsense()</script>")
     with browser(1280) as window:
         window.open(tmp_path / "wrong.html")
-        assert any("nonsense" in line for line in window.said())
+        assert any("nonsense" in line for line in window.console())
         assert any(address.startswith("http:") for address in window.requested())
 
 
