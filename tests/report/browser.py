@@ -83,13 +83,17 @@ class Browser:
         events = [json.loads(e["message"])["message"] for e in self._call("/se/log", {"type": "performance"})]
         return [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
 
+    def close(self) -> None:
+        """Close the window."""
+        _call("DELETE", self._address, None)
+
     def _call(self, path: str, body: Any) -> Any:
         return _call("POST", self._address + path, body)
 
 
 @contextlib.contextmanager
-def browser(width: int) -> Iterator[Browser]:
-    """Open a window, and close it in the end."""
+def running_driver() -> Iterator[str]:
+    """Start chromedriver, yield its address once it answers, and stop it in the end."""
     assert DRIVER is not None
     port = free_port()
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -101,13 +105,24 @@ def browser(width: int) -> Iterator[Browser]:
                     _call("GET", f"{address}/status", None)
                     break
                 time.sleep(0.1)
-            window = Browser(address, width)
-            try:
-                yield window
-            finally:
-                _call("DELETE", window._address, None)
+            yield address
         finally:
             driver.terminate()
+
+
+@contextlib.contextmanager
+def browser(address: str, width: int) -> Iterator[Browser]:
+    """Open a window of a running chromedriver, and close it in the end.
+
+    Args:
+        address: the address of chromedriver.
+        width: width of the window, in pixels.
+    """
+    window = Browser(address, width)
+    try:
+        yield window
+    finally:
+        window.close()
 
 
 def _call(method: str, url: str, body: Any) -> Any:
