@@ -148,7 +148,7 @@ def rows_of(
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="antmaze-medium")
     parser.add_argument("--preset", default="cpu")

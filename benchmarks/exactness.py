@@ -219,7 +219,7 @@ def examine(task: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = list(dict.fromkeys(spec.name for spec in envs.list_tasks()))
     parser.add_argument("--tasks", nargs="+", default=names)

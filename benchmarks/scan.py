@@ -35,7 +35,7 @@ def seconds(folder: Path, name: str, *flags: str) -> float:
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="JSON file for the result")
     args = parser.parse_args()

@@ -128,7 +128,7 @@ def points(member: Member, column: str) -> np.ndarray:
 
 
 def scans(study: Study) -> list[Scan]:
-    """Every key of which a method has several values on a task, with the success that each value led to."""
+    """Return each key of which a method has several values on a task, with the success under each value."""
     found = []
     for task in study.tasks:
         present = [setting for setting in study.settings if task in setting.members]
@@ -151,7 +151,7 @@ def scans(study: Study) -> list[Scan]:
 
 
 def surfaces(study: Study) -> list[Surface]:
-    """Every pair of keys with numbers for values of which a method has every combination on a task."""
+    """Return each pair of keys with numeric values of which a method has all combinations on a task."""
     found = []
     for task in study.tasks:
         for method in dict.fromkeys(setting.method for setting in study.settings):

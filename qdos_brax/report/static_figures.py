@@ -52,12 +52,12 @@ def draw_static_figures(study: Study, analyses: list[MemberAnalysis], out: Path)
 
 
 class _Kind(NamedTuple):
-    """A figure with a row of panels per member.
+    """Hold a kind of figure: a row of panels per member.
 
     Attributes:
         file: its name.
         shown: whether a member has what is needed.
-        draw: draws the panels of a member; panels that it leaves empty are blank.
+        draw: function that draws the panels of a member; it may leave panels empty.
         columns: panels per member.
     """
 

@@ -290,7 +290,7 @@ def _notes(settings: Sequence[Setting]) -> Iterable[str]:
     for member in everyone:
         name = f"{member.run} ({member.method}, seed {member.seed})"
         if member.frozen:
-            yield f"{name} was frozen because its numbers were no longer finite; it counts with its last evaluation"
+            yield f"{name} was frozen: its numbers were no longer finite; it counts with its last evaluation"
         if math.isnan(member.success):
             yield f"{name} was never evaluated, so table 1 leaves it out"
 
