@@ -12,7 +12,7 @@ from qdos_brax.errors import UserError
 from qdos_brax.report.study import Member, Run, Study
 from qdos_brax.runs.folder import RunFolder
 
-# By quality code, from good to bad in the codes that collected data have; further codes go on.
+# By quality code. Collected data have four codes, 0 for good behaviour; other data may have more.
 QUALITY_COLOURS = ("#009E73", "#56B4E9", "#E69F00", "#D55E00", "#CC79A7", "#0072B2")
 WALL_COLOUR = "#b4bac2"
 
