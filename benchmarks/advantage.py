@@ -1,9 +1,9 @@
-"""Do the weights know which segments gain ground? ``python benchmarks/advantage.py --env antmaze-medium --out FILE``.
+"""Measure how well advantages rank segments: ``python benchmarks/advantage.py --env antmaze-medium --out FILE``.
 
-Trains the values (and, for the latent advantage, the skills) as a run would, and ranks all segments of the data by each
-advantage. The truth, which training never sees, is how much of the shortest path to the task's goal a segment gains.
-Prints one row per value estimator, advantage and lambda, next to uniform weights and to the true distance in V's place,
-and writes CSV.
+Trains the values (and, for the latent advantage, the skills) as a run does, and ranks all segments of the data by each
+advantage. They are compared with the true progress, which training never sees: the decrease of the shortest path to the
+task's goal. Prints one row per value estimator, advantage and lambda, with uniform weights and with the true distance
+in place of V for comparison, and writes CSV.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ CONFIGURED = {"graph": ("segment", "latent"), "iql": ("segment", "latent", "tran
 
 
 class Scores(NamedTuple):
-    """Every segment's score[S]; correlation of V with minus the true distance; seconds that the values took."""
+    """Hold the score[S] of each segment, V's correlation with minus the true distance, and V's training seconds."""
 
     score: np.ndarray
     correlation: float
@@ -49,7 +49,7 @@ class Scores(NamedTuple):
 
 
 def run_phase(phase: Any, seed: int, artifacts: dict[str, Any]) -> Any:
-    """The phase's state after its last chunk."""
+    """Run all chunks of a phase and return its last state."""
     state = phase.init(jax.random.split(jax.random.key(seed), 1), artifacts)
     for _ in range(phase.num_chunks):
         state, _ = phase.chunk(state)
@@ -59,7 +59,7 @@ def run_phase(phase: Any, seed: int, artifacts: dict[str, Any]) -> Any:
 def scores(
     config: configs.Config, env: Any, dataset: Dataset, data: DeviceData, seed: int, advantages: list[str]
 ) -> dict[str, Scores]:
-    """By advantage, those of ``advantages`` that ``config.values.estimator`` has; as scaled by the configuration."""
+    """Return the scores of those ``advantages`` that ``config.values.estimator`` has, scaled as configured."""
     found: dict[str, Scores] = {}
     population = Population(configs.population_hyper(config))
     for name in advantages:
@@ -83,7 +83,7 @@ def scores(
 def state_values(
     config: configs.Config, env: Any, data: DeviceData, phase: GraphPhase | ValuePhase, state: Any
 ) -> np.ndarray:
-    """V of every logged state, [N]."""
+    """Return V of every logged state, float[N]."""
     if isinstance(phase, GraphPhase):
         return np.asarray(state[0])
     iql = IQL(env.observation_size, env.action_size, config.values.hidden)
@@ -92,7 +92,7 @@ def state_values(
 
 
 def correlation(env: Any, dataset: Dataset, values: np.ndarray) -> float:
-    """Pearson's, between V and minus the true distance, over the states that have one."""
+    """Return Pearson's correlation of V with minus the true distance, over the states whose distance is known."""
     distance = np.asarray(env.true_distance(dataset.qpos), np.float64)
     known = np.isfinite(distance)
     return float(np.corrcoef(values[known], -distance[known])[0, 1]) if values.std() > 0 else float("nan")
@@ -101,7 +101,7 @@ def correlation(env: Any, dataset: Dataset, values: np.ndarray) -> float:
 def latent_scores(
     config: configs.Config, env: Any, data: DeviceData, population: Population, artifacts: Any, seed: int
 ) -> np.ndarray:
-    """Q(s_0, z) - V(s_0) of every segment, after a skill phase without rollouts in which Q learned along."""
+    """Return Q(s_0, z) - V(s_0) of every segment, with Q trained along in a skill phase without rollouts."""
     skills = config.skills
     model = SkillModel(env.observation_size, env.action_size, skills.latent_dim, skills.encoder_hidden,
                        skills.encoder_layers, skills.decoder_hidden, skills.prior_hidden)  # fmt: skip
@@ -129,7 +129,7 @@ def rows_of(
     found: dict[tuple[str, str], Scores],
     temperatures: list[float],
 ) -> list[dict[str, Any]]:
-    """One row per estimator, advantage and lambda, with uniform weights and the true distance beside them."""
+    """Return one row per estimator, advantage and lambda, and rows for uniform weights and the true distance."""
     gains = quality.progress(env, dataset, starts, config.skills.horizon)
     degraded = None if dataset.quality is None else dataset.quality[starts] != quality.QUALITY["navigate"]
     ceiling = {("uniform", "none"): Scores(np.zeros(len(starts)), float("nan"), 0.0)}
@@ -148,17 +148,17 @@ def rows_of(
 
 
 def main() -> None:
-    """The command line."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="antmaze-medium")
     parser.add_argument("--preset", default="cpu")
-    parser.add_argument("--dataset", type=Path, help="default: the task's own set")
+    parser.add_argument("--dataset", type=Path, help="data file (default: the task's own data set)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--values", default="graph,iql", help="value estimators, comma-separated")
     parser.add_argument("--advantages", default="segment,latent,transition", help="comma-separated")
-    parser.add_argument("--lambdas", default="0.3,0.5,0.7,1.0", help="temperatures of the weight, comma-separated")
-    parser.add_argument("--set", action="append", default=[], help="key=value of the configuration")
-    parser.add_argument("--out", type=Path, help="CSV file, appended to")
+    parser.add_argument("--lambdas", default="0.3,0.5,0.7,1.0", help="temperatures of the weights, comma-separated")
+    parser.add_argument("--set", action="append", default=[], help="KEY=VALUE for the configuration; may be repeated")
+    parser.add_argument("--out", type=Path, help="CSV file to append to")
     args = parser.parse_args()
     prepare_jax()
     started = time.perf_counter()
@@ -201,7 +201,7 @@ def main() -> None:
 
 
 def share(dataset: Dataset) -> float:
-    """The share of the rows that come from degraded behaviour, to two digits; NaN where nobody knows."""
+    """Return the share of rows from degraded behaviour, to two digits; NaN if it is unknown."""
     if dataset.quality is None:
         return float("nan")
     return round(float(np.mean(dataset.quality != quality.QUALITY["navigate"])), 2)

@@ -1,15 +1,15 @@
-"""How exact the physics is: ``python benchmarks/exactness.py [--out results/exactness.json]``.
+"""Measure the accuracy of the physics: ``python benchmarks/exactness.py [--out results/exactness.json]``.
 
-On states that rollouts visit, half of them of a walker and half of random actions (the humanoid has random actions
-only), three quarters of them started at a wall:
+The states are visited by rollouts, half of them of a walker and half of random actions (the humanoid has random actions
+only); three quarters of the rollouts start at a wall. Measured are:
 
 - *MuJoCo C engine against OGBench's environment*: the largest difference of any coordinate of qpos and qvel, in
-  float64, over whole rollouts. Teleporters are switched off in this (OGBench draws exits from a generator of its own);
+  float64, over whole rollouts. Teleporters are switched off (OGBench draws exits from a generator of its own);
   ``tests/envs/test_parity.py`` compares them.
-- *MJX engine against the MuJoCo C engine*: the error of one control step, the largest of any coordinate of qpos, apart
-  for states that touch a wall (or the ball) in that step; and how far the bodies are apart after 100 steps under the
-  same policy, next to how far they went.
-- *Contacts* that a state has, by dimension, and the share of states with more than MJX keeps.
+- *MJX engine against the MuJoCo C engine*: the error of one control step, the largest of any coordinate of qpos,
+  separately for states that touch a wall (or the ball) in that step; and the distance between the bodies after 100
+  steps under the same policy, next to the distance that they covered.
+- *Contacts* of a state, by dimension, and the share of states with more contacts than MJX keeps.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ HOLD = 4  # control steps for which a random action is held
 
 
 class States(NamedTuple):
-    """Visited states: qpos[N, nq], qvel[N, nv], and an action[N, nu] for each."""
+    """Hold visited states: qpos[N, nq], qvel[N, nv], and an action[N, nu] for each."""
 
     qpos: np.ndarray
     qvel: np.ndarray
@@ -48,11 +48,11 @@ class States(NamedTuple):
 
 
 class Policy:
-    """Walks along a direction in the first half of the environments, acts at random in the others.
+    """Walk along a direction in the first half of the environments, act at random in the others.
 
     Args:
-        env: the task; of bodies without a shipped walker all act at random.
-        seed: of directions and actions.
+        env: the task; bodies without a shipped walker act at random in all environments.
+        seed: the seed of directions and actions.
     """
 
     def __init__(self, env: Any, seed: int) -> None:
@@ -68,7 +68,7 @@ class Policy:
             self._walk = None
 
     def act(self, step: int, state: Any) -> np.ndarray:
-        """float32[ROLLOUTS, nu]; ``step`` is below ``DRIFT_STEPS``."""
+        """Return the actions float32[ROLLOUTS, nu] of a step below ``DRIFT_STEPS``."""
         action = self._random[step // HOLD]
         if self._walk is None:
             return action
@@ -76,7 +76,7 @@ class Policy:
 
 
 def starts(env: Any, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """float32 (qpos[ROLLOUTS, nq], qvel[ROLLOUTS, nv]), most of them at a wall and moving towards it."""
+    """Return float32 (qpos[ROLLOUTS, nq], qvel[ROLLOUTS, nv]), most at a wall and moving towards it."""
     rng = np.random.default_rng(seed)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(seed), ROLLOUTS)).pipeline_state
     qpos, qvel = np.array(state.qpos), np.array(state.qvel)
@@ -96,7 +96,7 @@ def starts(env: Any, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def visited(env: Any, step: Any, seed: int = 0) -> States:
-    """``STATES`` states along rollouts of MuJoCo C."""
+    """Return ``STATES`` states along rollouts of MuJoCo C."""
     policy, rng = Policy(env, seed), np.random.default_rng(seed)
     state = jax.vmap(env.engine.init)(*starts(env, seed))
     rows = []
@@ -109,7 +109,7 @@ def visited(env: Any, step: Any, seed: int = 0) -> States:
 
 
 def touching(env: Any, states: States) -> tuple[np.ndarray, list[Counter[int]]]:
-    """bool[N], whether a wall or the ball is touched in the step (in C), and contacts by dimension at its worst."""
+    """Return bool[N], whether a step touches wall or ball (in C), and its most contacts by dimension."""
     model = env.whole_model()
     data = mujoco.MjData(model)
     hard = [g for g in range(model.ngeom) if model.geom(g).name.startswith("block_") or model.geom(g).name == "ball"]
@@ -129,7 +129,7 @@ def touching(env: Any, states: States) -> tuple[np.ndarray, list[Counter[int]]]:
 
 
 def against_ogbench(env: Any, step: Any, seed: int = 1) -> dict[str, Any]:
-    """The MuJoCo C engine and OGBench's environment side by side for 100 steps from each of ``REPLAYED`` starts."""
+    """Compare the MuJoCo C engine with OGBench's environment over 100 steps from each of ``REPLAYED`` starts."""
     import gymnasium
     import ogbench  # noqa: F401  (registers the environments)
 
@@ -158,7 +158,7 @@ def against_ogbench(env: Any, step: Any, seed: int = 1) -> dict[str, Any]:
 
 
 def one_step_errors(env: Any, c_step: Any, mjx_engine: Any, mjx_step: Any) -> dict[str, Any]:
-    """Quantiles of the error in qpos, apart for free states and those in touch, and the contacts."""
+    """Return quantiles of the error in qpos, for states with and without touch, and the contacts."""
     states = visited(env, c_step)
     mjx_start = jax.jit(jax.vmap(mjx_engine.init))
     errors = []
@@ -180,7 +180,7 @@ def one_step_errors(env: Any, c_step: Any, mjx_engine: Any, mjx_step: Any) -> di
 
 
 def drift(env: Any, c_step: Any, mjx_engine: Any, mjx_step: Any, seed: int = 2) -> dict[str, Any]:
-    """Distance between the bodies on either engine after ``DRIFT_STEPS`` steps, and from their start."""
+    """Return the distance between the bodies of both engines after ``DRIFT_STEPS`` steps, and from their start."""
     policy = Policy(env, seed)
     qpos, qvel = starts(env, seed)
     ends = []
@@ -195,7 +195,7 @@ def drift(env: Any, c_step: Any, mjx_engine: Any, mjx_step: Any, seed: int = 2) 
 
 
 def quantiles(values: np.ndarray) -> dict[str, float]:
-    """Count, median, p90, p99 and maximum."""
+    """Return count, median, p90, p99 and maximum."""
     if len(values) == 0:
         return {"count": 0}
     marks = dict(zip(("median", "p90", "p99", "max"), np.quantile(values, [0.5, 0.9, 0.99, 1.0]), strict=True))
@@ -203,13 +203,13 @@ def quantiles(values: np.ndarray) -> dict[str, float]:
 
 
 def both_engines(task: str) -> tuple[Any, Any, Any, Any]:
-    """The task on MuJoCo C, its compiled batched step, the engine on MJX, and its step."""
+    """Return the task on MuJoCo C, its compiled batched step, the engine on MJX, and its compiled batched step."""
     env, mjx_engine = envs.make(task, physics="mujoco"), envs.make(task, physics="mjx").engine
     return env, jax.jit(jax.vmap(env.engine.step)), mjx_engine, jax.jit(jax.vmap(mjx_engine.step))
 
 
 def examine(task: str) -> dict[str, Any]:
-    """All figures of one task."""
+    """Return all measurements of one task."""
     env, c_step, mjx_engine, mjx_step = both_engines(task)
     return {
         "mujoco_against_ogbench": against_ogbench(env, c_step),
@@ -219,11 +219,11 @@ def examine(task: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = list(dict.fromkeys(spec.name for spec in envs.list_tasks()))
     parser.add_argument("--tasks", nargs="+", default=names)
-    parser.add_argument("--out", type=Path, help="JSON file; what it holds of other tasks stays")
+    parser.add_argument("--out", type=Path, help="JSON file for the result; its entries of other tasks are kept")
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     found: dict[str, Any] = json.loads(args.out.read_text()) if args.out and args.out.exists() else {}

@@ -1,18 +1,18 @@
-"""How fast the physics is: ``python benchmarks/physics.py [--out results/physics.json]``.
+"""Measure the speed of the physics: ``python benchmarks/physics.py [--out results/physics.json]``.
 
-Environment steps per second (one step is one control step of one environment under random actions), seconds from
-nothing compiled to the first step done, and peak memory, of
+Measures environment steps per second (one step is one control step of one environment under random actions), seconds
+from an empty compilation cache to the end of the first step, and peak memory, of
 
-    stock-mjx     OGBench's own model, all walls, on MJX as it comes (without observation, reward or reset)
+    stock-mjx     OGBench's own model, all walls, on unmodified MJX (without observation, reward or reset)
     mjx           our environment on MJX, reset included
-    mjx-warp      our environment on MuJoCo Warp, reset included (CUDA alone; only where --kinds names it)
+    mjx-warp      our environment on MuJoCo Warp, reset included (CUDA only; only if --kinds names it)
     mujoco        our environment on MuJoCo C, inside jit, reset included
-    bare          OGBench's model, all walls, in a plain pool of threads (without observation, reward or reset)
-    gymnasium     OGBench's environment, one of them
-    async         gymnasium's AsyncVectorEnv around it, one worker per core
+    bare          OGBench's model, all walls, in a plain thread pool (without observation, reward or reset)
+    gymnasium     one environment of OGBench
+    async         environments of OGBench in gymnasium's AsyncVectorEnv, one worker per core
 
-Every cell runs in a process of its own, with no compilation cache, one after the other. A cell that does not finish
-in ``--limit`` seconds is reported as such. The table goes to standard output, everything to the JSON file.
+Each cell runs in a process of its own, without a compilation cache, one after the other. A cell that does not finish
+in ``--limit`` seconds is reported as such. The table goes to standard output, all results to the JSON file.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ FRAME_SKIP = 5
 CORES = len(os.sched_getaffinity(0))
 
 
-# --- One cell: a function that makes n steps of all environments -------------------------------------------------
+# --- One cell: a function that steps all environments some times -------------------------------------------------
 
 
 def ours(task: str, batch: int, physics: str, control_steps: int) -> Callable[[], int]:
-    """Our environment with auto-reset, ``control_steps`` in one program."""
+    """Return a function that steps our environment with auto-reset, ``control_steps`` in one program."""
     import jax
 
     import envs
@@ -70,7 +70,7 @@ def ours(task: str, batch: int, physics: str, control_steps: int) -> Callable[[]
 
 
 def stock_mjx(task: str, batch: int) -> Callable[[], int]:
-    """``mjx.step`` of OGBench's model as it is."""
+    """Return a function that calls ``mjx.step`` on OGBench's unmodified model."""
     import jax
     import jax.numpy as jnp
     from mujoco import mjx
@@ -100,7 +100,7 @@ def stock_mjx(task: str, batch: int) -> Callable[[], int]:
 
 
 def bare(task: str, batch: int, control_steps: int) -> Callable[[], int]:
-    """MuJoCo's own batch stepper on the task's model with all walls, from the task's starts, actions ready-made."""
+    """Return a function that calls MuJoCo's batch stepper on the task's model, all walls, with prepared actions."""
     import jax
     from mujoco.batch import Batch
 
@@ -124,7 +124,7 @@ def bare(task: str, batch: int, control_steps: int) -> Callable[[], int]:
 
 
 def gymnasium_single(task: str, control_steps: int) -> Callable[[], int]:
-    """OGBench's environment in a Python loop."""
+    """Return a function that steps one environment of OGBench in a Python loop."""
     env = ogbench_env(task)
     env.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (control_steps, *env.action_space.shape)).astype(np.float32)
@@ -140,7 +140,7 @@ def gymnasium_single(task: str, control_steps: int) -> Callable[[], int]:
 
 
 def gymnasium_async(task: str, control_steps: int) -> Callable[[], int]:
-    """One worker process per core."""
+    """Return a function that steps environments of OGBench in one worker process per core."""
     import gymnasium
 
     env = gymnasium.vector.AsyncVectorEnv([lambda: ogbench_env(task)] * CORES)
@@ -156,7 +156,7 @@ def gymnasium_async(task: str, control_steps: int) -> Callable[[], int]:
 
 
 def ogbench_env(task: str) -> Any:
-    """OGBench's single-task environment of the same name."""
+    """Return OGBench's single-task environment of the same name."""
     import gymnasium
     import ogbench  # noqa: F401  (registers the environments)
 
@@ -166,7 +166,7 @@ def ogbench_env(task: str) -> Any:
 
 
 def make_cell(kind: str, task: str, batch: int) -> Callable[[], int]:
-    """The function whose calls are timed; it returns how many environment steps it made."""
+    """Return the function whose calls are timed; it returns the number of environment steps it made."""
     if kind in ("mjx", "mjx-warp", "mujoco"):
         return ours(task, batch, kind, control_steps=50 if kind == "mujoco" else 5)
     if kind == "stock-mjx":
@@ -177,7 +177,7 @@ def make_cell(kind: str, task: str, batch: int) -> Callable[[], int]:
 
 
 def measure(kind: str, task: str, batch: int, seconds: float) -> dict[str, Any]:
-    """Calls the cell for ``seconds`` after a first time; the rate is that of the whole window."""
+    """Call the cell once, then repeatedly for ``seconds``; return the rate over that time, first step and memory."""
     began = time.perf_counter()
     steps = make_cell(kind, task, batch)
     steps()
@@ -195,26 +195,26 @@ def measure(kind: str, task: str, batch: int, seconds: float) -> dict[str, Any]:
 
 
 def run_cell(kind: str, task: str, batch: int, seconds: float, limit: float) -> dict[str, Any]:
-    """``measure`` in a process of its own."""
+    """Run ``measure`` in a process of its own; an error or a time limit is part of the result."""
     head = {"kind": kind, "task": task, "batch": batch}
     command = [sys.executable, __file__, "--cell", kind, task, str(batch), "--seconds", str(seconds)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=limit, check=True)
     except subprocess.TimeoutExpired:
-        return {**head, "error": f"not done in {limit:.0f} s"}
+        return {**head, "error": f"did not finish in {limit:.0f} s"}
     except subprocess.CalledProcessError as error:
         return {**head, "error": (error.stderr.strip().splitlines() or [f"exit {error.returncode}"])[-1]}
     return {**head, **json.loads(done.stdout.splitlines()[-1])}
 
 
 def cells(tasks: list[str], kinds: list[str], batches: list[int]) -> list[tuple[str, str, int]]:
-    """(kind, task, batch); gymnasium's environments have no choice of batch."""
+    """Return all (kind, task, batch); the batch of gymnasium's environments is fixed."""
     fixed = {"gymnasium": [1], "async": [CORES]}
     return [(kind, task, batch) for task in tasks for kind in kinds for batch in fixed.get(kind, batches)]
 
 
 def ratios(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Ours at 64 environments against the yardsticks, by task."""
+    """Return the speed of our 64 environments as ratios to the references, by task."""
     speed = {(row["kind"], row["task"], row["batch"]): row.get("steps_per_second") for row in rows}
     found = []
     for task in dict.fromkeys(row["task"] for row in rows):
@@ -235,7 +235,7 @@ def _ratio(a: float | None, b: float | None) -> float | None:
 
 
 def write(path: Path, rows: list[dict[str, Any]], seconds: float) -> None:
-    """The JSON file, whole or not at all."""
+    """Write the JSON file, as a whole or not at all."""
     import jax
     import mujoco
 
@@ -249,16 +249,14 @@ def write(path: Path, rows: list[dict[str, Any]], seconds: float) -> None:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS))
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=[kind for kind in KINDS if kind != "mjx-warp"])
     parser.add_argument("--batches", nargs="+", type=int, default=list(BATCHES))
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of a measurement (default 5)")
-    parser.add_argument(
-        "--limit", type=float, default=300.0, help="seconds after which a cell is given up (default 300)"
-    )
-    parser.add_argument("--out", type=Path, help="JSON file")
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of one measurement (default: 5)")
+    parser.add_argument("--limit", type=float, default=300.0, help="most seconds that a cell may take (default: 300)")
+    parser.add_argument("--out", type=Path, help="JSON file for the result")
     parser.add_argument("--cell", nargs=3, metavar=("KIND", "TASK", "BATCH"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.cell:

@@ -1,8 +1,7 @@
-"""What a scan saves: ``python benchmarks/scan.py [--out results/scan.json]``.
+"""Measure the time that a scan saves: ``python benchmarks/scan.py [--out results/scan.json]``.
 
-Nine members of antmaze-medium (three alphas x three seeds, preset smoke) as one command, and as nine commands. Each
-command is a fresh process; the scan has a compilation cache of its own, and each of the nine too, so that all start
-cold. The data are made before the clock starts.
+Runs nine members of antmaze-medium (three alphas x three seeds, preset smoke) as one command and as nine commands. Each
+command is a new process with an empty compilation cache of its own. The data are made before the measurement starts.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ ALPHAS, SEEDS = ("0.1", "0.2", "0.3"), ("0", "1", "2")
 
 
 def seconds(folder: Path, name: str, *flags: str) -> float:
-    """Wall seconds of one command with an empty compilation cache."""
+    """Return the wall seconds of one command with an empty compilation cache."""
     cache = folder / f"{name}-cache"
     env = {**os.environ, "QDOS_DATA": str(folder / "data"), "JAX_COMPILATION_CACHE_DIR": str(cache)}
     command = [sys.executable, str(ROOT / "train.py"), *SETTINGS, *flags, "--out", str(folder / name)]
@@ -36,15 +35,16 @@ def seconds(folder: Path, name: str, *flags: str) -> float:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="JSON file")
+    parser.add_argument("--out", type=Path, help="JSON file for the result")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         seconds(folder, "data", "--pretrain-steps", "1", "--steps", "80")  # makes the data
         members = list(itertools.product(ALPHAS, SEEDS))
-        # Half of the single commands before the scan and half after it: a machine that drifts favours neither.
+        # About half of the single commands run before the scan and the others after it, so that a machine that becomes
+        # slower or faster favours neither.
         single = [seconds(folder, f"single-{a}-{s}", "--alpha", a, "--seed", s) for a, s in members[:4]]
         scan = seconds(folder, "scan", "--alpha", ",".join(ALPHAS), "--seed", ",".join(SEEDS))
         single += [seconds(folder, f"single-{a}-{s}", "--alpha", a, "--seed", s) for a, s in members[4:]]

@@ -1,4 +1,4 @@
-"""A look inside a finished run, for its page: what it takes segments of the data for, and what its skills do."""
+"""The analysis of a finished run for its page: how it weighs and encodes segments of the data, what its skills do."""
 
 from __future__ import annotations
 
@@ -30,40 +30,43 @@ from qdos_brax.skills.vae import Segments
 from qdos_brax.skills.weights import advantage_weights
 
 _SEGMENTS = 600
-_MEMBERS = 3  # looked at: the first seed of each of the first settings
+_MEMBERS = 3  # the most members that are analysed: the first seed of each of the first settings
 _GRID = 5  # skills along each of the two main directions of the latents
-_SPREAD = 2.0  # how far the grid reaches along them, in standard deviations
-_BETWEEN = 9  # skills on the way from one to another
-_HELD = 3  # segments' lengths that a skill is held for on the map
+_SPREAD = 2.0  # how far the grid extends along them, in standard deviations
+_BETWEEN = 9  # skills on the line from one to another
+_HELD = 3  # the time that a skill is kept for on the map, in lengths of a segment
 _FRAMES = 6
 _FRAME_HEIGHT = 240
-_SEED = 0  # of the segments looked at, and of t-SNE
+_SEED = 0  # of the sample of segments, and of t-SNE
 
 Arrays = dict[str, np.ndarray]
 
 
 def look_inside(run: Path) -> None:
-    """Writes inside.npz into the folder of a finished run; what cannot be had (no states, no OpenGL) is left out.
+    """Write inside.npz into the folder of a finished run.
 
-    Its arrays, with m the number of a member that was looked at:
-        members: int[M], their numbers.
-        gain, return, quality: [n], of random segments of the data: units of shortest path to the goal that they gain,
-            undiscounted return, code in ``data.quality.QUALITY``.
-        m/weight: float[n], the weight that each segment had (methods that weigh them).
-        m/latent, m/tsne: float[n, z], float[n, 2], the posterior's means and where t-SNE puts them (methods that infer
+    Arrays that the task, the method or the machine (without OpenGL) cannot give are left out.
+
+    Its arrays, where m is the number of an analysed member:
+        members: int[M], the numbers of the analysed members.
+        gain, return, quality: [n], of random segments of the data: the decrease of the shortest path to the goal,
+            undiscounted return, index into ``quality_names``.
+        quality_names: str[..], the names in ``data.quality.QUALITY`` by their codes.
+        m/weight: float[n], the weight of each segment (methods that weigh them).
+        m/latent, m/tsne: float[n, z], float[n, 2], the posterior's means and their t-SNE embedding (methods that infer
             skills from segments).
-        m/grid, m/between: float[k, T, 2], where the body goes from the task's start with skills along the two main
-            directions of the latents, and with those between two segments' own.
-        m/path, m/left, m/latents: float[T, 2], float[T], float[K, z]: an evaluation episode: where the body was, how
-            far it had to go, and the latent of every decision.
-        m/frames, m/frame_steps: uint8[F, height, width, 3], int[F], the scene at some of its steps.
-        goal, walls: float[2], float[W, 2], the goal, and the centres of the wall cells.
+        m/grid, m/between: float[k, T, 2], the positions from the task's start on, under skills along the two
+            main directions of the latents, and under skills between the latents of two segments.
+        m/path, m/left, m/latents: float[T, 2], float[T], float[K, z]: an evaluation episode: positions, the
+            distance left to the goal, and the latent of each decision.
+        m/frames, m/frame_steps: uint8[F, height, width, 3], int[F], pictures of the scene at some of its steps.
+        goal, walls: float[2], float[W, 2], the goal and the centres of the wall cells.
 
     Args:
         run: the run folder.
 
     Raises:
-        UserError: the run has not ended, its data are gone, or the file cannot be written.
+        UserError: the run has not finished, its data are gone, or the file cannot be written.
     """
     trained = load_run(run)
     # On MuJoCo C whatever the run was on: a few episodes are not worth MJX's compilation.
@@ -82,12 +85,12 @@ def look_inside(run: Path) -> None:
 
 
 class _Sample(NamedTuple):
-    """Segments of a run's data.
+    """Hold a sample of the segments of a run's data.
 
     Attributes:
         dataset: the data.
-        data: the same on the device.
-        chosen: int[n], which of all segments.
+        data: the same data on the device.
+        chosen: int[n], the indices of the segments among all segments.
         starts: int[n], their first rows.
     """
 
@@ -98,7 +101,7 @@ class _Sample(NamedTuple):
 
 
 def _sample(folder: RunFolder, trained: TrainedRun) -> _Sample:
-    """Random segments, the same for every method on the same data."""
+    """Draw random segments, the same ones for every method on the same data."""
     try:
         path = Path(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["path"])
     except (OSError, ValueError, KeyError) as error:
@@ -111,7 +114,7 @@ def _sample(folder: RunFolder, trained: TrainedRun) -> _Sample:
 
 
 def _first_seeds(trained: TrainedRun) -> list[int]:
-    """The first member of each setting, some of them."""
+    """Return the first member of each of the first settings."""
     members = configs.members(trained.config)
     settings = [tuple(value for key, value in member.items() if key != "seed") for member in members]
     return sorted({settings.index(setting) for setting in settings})[:_MEMBERS]
@@ -126,7 +129,7 @@ def _place(env: Any) -> Arrays:
 
 
 def _truth(trained: TrainedRun, sample: _Sample) -> Arrays:
-    """What is known of the segments without any learner."""
+    """Return what is known of the segments without a learner."""
     dataset, starts, horizon = sample.dataset, sample.starts, trained.config.skills.horizon
     found: Arrays = {"return": dataset.rewards[starts[:, None] + np.arange(horizon)].sum(axis=1)}
     if dataset.qpos is not None:
@@ -134,6 +137,7 @@ def _truth(trained: TrainedRun, sample: _Sample) -> Arrays:
         found["gain"] = np.where(np.isfinite(gain), gain, np.nan).astype(np.float32)
     if dataset.quality is not None:
         found["quality"] = dataset.quality[starts]
+        found["quality_names"] = np.asarray(sorted(quality.QUALITY, key=quality.QUALITY.__getitem__))
     return found
 
 
@@ -146,7 +150,7 @@ def _weights(trained: TrainedRun, member: int, sample: _Sample) -> Arrays:
 
 
 class _LatentView:
-    """Latents of the segments, and what skills along them do; compiled once for all members.
+    """Compute latents of the segments and the paths of skills; compiled once for all members.
 
     Args:
         trained: the run.
@@ -164,12 +168,12 @@ class _LatentView:
         self._play = jax.jit(jax.vmap(self._path, in_axes=(None, None, 0)))
 
     def of(self, member: int) -> Arrays:
-        """What there is of a member; nothing of methods without skills."""
+        """Return the arrays of a member; none for methods without skills."""
         if "skills" not in self._trained.artifacts or self._trained.config.skills.horizon == 1:
             return {}
         artifacts, hyper = of_member(self._trained, member)
         latents = np.asarray(self._posterior(artifacts["skills"], self._segments, self._after).mean)
-        if not np.isfinite(latents).all():  # of a member that was frozen
+        if not np.isfinite(latents).all():  # the member was frozen
             return {}
         found: Arrays = {"latent": latents}
         if len(latents) > _GRID:
@@ -179,7 +183,7 @@ class _LatentView:
         return found | {"grid": paths[: len(grid)], "between": paths[len(grid) :]}
 
     def _path(self, artifacts: Any, hyper: Any, latent: jax.Array) -> jax.Array:
-        """[T + 1, 2], where the body goes from one start with a latent."""
+        """Return float[T + 1, 2], the positions from the start on while one latent is kept."""
         env, agent = self._trained.env, self._trained.agent(artifacts, hyper)
 
         def step(state: Any, _: None) -> tuple[Any, jax.Array]:
@@ -192,28 +196,28 @@ class _LatentView:
 
 
 def _tsne(latents: np.ndarray) -> np.ndarray:
-    """float32[n, 2], for the eye."""
+    """Return float32[n, 2], the t-SNE embedding."""
     perplexity = min(30.0, (len(latents) - 1) / 3)
-    with threadpool_limits(1):  # its threads wait for each other at every step, for ever where cores are scarce
+    with threadpool_limits(1):  # on few cores its threads can wait for each other without end
         return np.asarray(TSNE(perplexity=perplexity, init="pca", random_state=_SEED).fit_transform(latents))
 
 
 def _main_directions(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(mean[z], axes[2, z]): the two directions in which latents spread most, as long as their standard deviation."""
+    """Return (mean[z], axes[2, z]): the two directions of largest variance, as long as their standard deviation."""
     mean = latents.mean(axis=0)
     _, sizes, axes = np.linalg.svd(latents - mean, full_matrices=False)
     return mean, axes[:2] * sizes[:2, None] / np.sqrt(len(latents))
 
 
 def _grid(latents: np.ndarray) -> np.ndarray:
-    """float[_GRID^2, z], row by row."""
+    """Return float[_GRID^2, z], latents on a grid along the two main directions, row by row."""
     mean, axes = _main_directions(latents)
     ticks = np.linspace(-_SPREAD, _SPREAD, _GRID)
     return np.asarray([mean + np.array([x, y])[: len(axes)] @ axes for y in ticks for x in ticks], np.float32)
 
 
 def _between(latents: np.ndarray) -> np.ndarray:
-    """float[_BETWEEN, z], straight from one segment's latent to another's, far apart along the main direction."""
+    """Return float[_BETWEEN, z], on a line between the latents of two segments far apart in the main direction."""
     mean, axes = _main_directions(latents)
     order = np.argsort((latents - mean) @ axes[0])
     first, last = latents[order[len(order) // 20]], latents[order[-1 - len(order) // 20]]

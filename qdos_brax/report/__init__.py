@@ -1,1 +1,1 @@
-"""Pictures and tables made from run folders; nothing here knows a learner."""
+"""Tables, figures and the page of finished runs, made from their run folders; nothing here knows a learner."""

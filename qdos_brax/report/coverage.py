@@ -1,4 +1,4 @@
-"""Where a data set has been, as a PNG."""
+"""A map of the places that a data set visits, as a PNG file."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _BINS_PER_CELL = 8
 
 
 def draw_coverage(qpos: np.ndarray, env: Any, out: Path, title: str) -> None:
-    """Draws how often each place was visited: one panel for the body, one for the ball where there is one.
+    """Draw how often each place was visited: one panel for the body, one for the ball where there is one.
 
     Args:
         qpos: float[N, nq].
         env: the task, for its maze and its goal.
-        out: the picture, ending in .png; its folder must exist. It is replaced at once or not at all.
-        title: a line above.
+        out: the file, ending in .png; its folder must exist. It is replaced as a whole or not at all.
+        title: the line above the map.
 
     Raises:
-        UserError: the picture cannot be written.
+        UserError: the file has another ending or cannot be written.
     """
     if out.suffix != ".png":
         raise UserError(f"a map is written as .png, not as {out.name}; choose another name for it")

@@ -1,4 +1,4 @@
-"""Learning curves and scans, as PNGs."""
+"""Learning curves and scans, as PNG files."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qdos_brax.files import replacing
-from qdos_brax.report.parts import PALETTE
+from qdos_brax.report.elements import PALETTE
 from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
-from qdos_brax.report.study import Study, plain, short
+from qdos_brax.report.study import Study, format_value, short_key
 
-TICKS = 8  # values of a scan that can all be written on its axis
+TICKS = 8  # the most values of a scan that all get a label on its axis
 MEASURES = (("eval/success", "success"), ("eval/return", "return"))
 
 
 def draw_curves(study: Study, out: Path) -> None:
-    """Draws success and return over the environment steps, a row of panels per task.
+    """Draw success and return over the environment steps, a row of panels per task.
 
-    A thick line is the mean of a setting's members, the band its 95 % bootstrap interval, a thin line a member; dashed
-    across: a method that only learned offline.
+    A thick line is the mean of a setting's members, the band its 95 % bootstrap interval, a thin line a member. A
+    dashed horizontal line is a method that only learned offline.
 
     Args:
         study: what was run.
-        out: the picture; its folder must exist.
+        out: the file; its folder must exist.
 
     Raises:
-        UserError: the picture cannot be written.
+        UserError: the file cannot be written.
     """
     tasks = len(study.tasks)
     figure, axes = plt.subplots(tasks, len(MEASURES), figsize=(11, 4 * tasks), layout="constrained", squeeze=False)
-    colours = colours_of(study)
+    colours = setting_colours(study)
     for row, task in zip(axes, study.tasks, strict=True):
         for axis, (column, name) in zip(row, MEASURES, strict=True):
             for curve in curves(study, task, column):
@@ -47,37 +47,37 @@ def draw_curves(study: Study, out: Path) -> None:
             axis.set_title(task)
             axis.grid(alpha=0.3)
             if not axis.lines:
-                axis.text(0.5, 0.5, f"no {column} yet", ha="center", va="center", transform=axis.transAxes)
+                axis.text(0.5, 0.5, f"no {column} measured", ha="center", va="center", transform=axis.transAxes)
         row[0].set_ylim(-0.02, 1.02)
         if row[0].lines:
             row[0].legend(fontsize="small")
-    save(figure, out)
+    save_figure(figure, out)
 
 
 def draw_scans(study: Study, out: Path) -> bool:
-    """Draws final success over everything that was varied, a panel for each; False, and no file, if nothing was."""
+    """Draw final success over each hyperparameter that was varied; return False, without a file, if none was."""
     found = scans(study)
     if not found:
         return False
     figure, axes = plt.subplots(1, len(found), figsize=(5.5 * len(found), 4), layout="constrained", squeeze=False)
     for axis, scan in zip(axes[0], found, strict=True):
         _draw_scan(axis, scan)
-    save(figure, out)
+    save_figure(figure, out)
     return True
 
 
-def colours_of(study: Study) -> dict[str, str]:
-    """One colour per setting, by label; the same in every figure of a report."""
+def setting_colours(study: Study) -> dict[str, str]:
+    """Return one colour per setting, by label; it is the same in every figure of a report."""
     return {setting.label: PALETTE[i % len(PALETTE)] for i, setting in enumerate(study.settings)}
 
 
-def positions(line: ScanLine, scan: Scan) -> tuple[list[float], list[str] | None]:
-    """Where a scan's values lie on the axis: numbers where they are, words one after another, with their names."""
+def axis_positions(line: ScanLine, scan: Scan) -> tuple[list[float], list[str] | None]:
+    """Return the places of a line's values on the axis, and the labels of the places if the values are words."""
     every = [value for other in scan.lines for value in other.values]
     if all(isinstance(value, int | float) and not isinstance(value, bool) for value in every):
         return [float(value) for value in line.values], None
-    names = list(dict.fromkeys(map(plain, every)))
-    return [float(names.index(plain(value))) for value in line.values], names
+    names = list(dict.fromkeys(map(format_value, every)))
+    return [float(names.index(format_value(value))) for value in line.values], names
 
 
 def _draw_curve(axis: Axes, curve: Curve, colour: str) -> None:
@@ -98,7 +98,7 @@ def _draw_curve(axis: Axes, curve: Curve, colour: str) -> None:
 
 def _draw_scan(axis: Axes, scan: Scan) -> None:
     for line, colour in zip(scan.lines, itertools.cycle(PALETTE), strict=False):
-        x, _ = positions(line, scan)
+        x, _ = axis_positions(line, scan)
         errors = np.nan_to_num(np.stack([line.mean - line.low, line.high - line.mean]))
         label = f"{line.label} (mean, 95 %)"
         if line.joined:
@@ -107,19 +107,19 @@ def _draw_scan(axis: Axes, scan: Scan) -> None:
             axis.plot([], [], "o", color=colour, label=line.label)
         for at, members in zip(x, line.members, strict=True):
             axis.plot([at] * len(members), [m.success for m in members], ".", color=colour, alpha=0.5)
-    ticks = sorted({at for line in scan.lines for at in positions(line, scan)[0]})
-    if scan.wide:
+    ticks = sorted({at for line in scan.lines for at in axis_positions(line, scan)[0]})
+    if scan.log_scale:
         axis.set_xscale("log")
     if len(ticks) <= TICKS:
-        axis.set_xticks(ticks, positions(scan.lines[0], scan)[1] or [plain(tick) for tick in ticks])
+        axis.set_xticks(ticks, axis_positions(scan.lines[0], scan)[1] or [format_value(tick) for tick in ticks])
         axis.set_xticks([], minor=True)
-    axis.set(xlabel=short(scan.key), ylabel="success at the last evaluation", title=scan.task, ylim=(-0.02, 1.02))
+    axis.set(xlabel=short_key(scan.key), ylabel="success at the last evaluation", title=scan.task, ylim=(-0.02, 1.02))
     axis.grid(alpha=0.3)
     axis.legend(fontsize="small")
 
 
-def save(figure: Figure, out: Path) -> None:
-    """Writes a picture, at once or not at all, and forgets the figure."""
+def save_figure(figure: Figure, out: Path) -> None:
+    """Write a figure to a file, as a whole or not at all, and free its memory."""
     try:
         with replacing(out) as partial:
             figure.savefig(partial, dpi=120)

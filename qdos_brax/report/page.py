@@ -1,4 +1,4 @@
-"""report.html: one file that holds everything it shows, and asks no network for anything."""
+"""report.html: one file that holds everything it shows and loads nothing from the network."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from typing import Any
 import jinja2
 
 from qdos_brax.files import write_text
-from qdos_brax.report.curves import colours_of
-from qdos_brax.report.looks import Look
-from qdos_brax.report.parts import Section, member_id
+from qdos_brax.report.curves import setting_colours
+from qdos_brax.report.elements import Section, member_id
+from qdos_brax.report.member_analysis import MemberAnalysis
 from qdos_brax.report.sections import sections
 from qdos_brax.report.study import Study
 
-_SHOWN_AS_THEY_ARE = ("title", "text", "cards", "choices", "tables", "images", "listings", "opened")
+_PASSED_ON = ("title", "text", "cards", "choices", "tables", "images", "listings", "expanded")
 
 
-def write_page(study: Study, looks: list[Look], out: Path) -> None:
-    """Writes the page.
+def write_page(study: Study, analyses: list[MemberAnalysis], out: Path) -> None:
+    """Write the page.
 
     Args:
         study: what was run.
-        looks: what was seen inside its runs.
+        analyses: what was found inside its runs.
         out: the file; its folder must exist.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the file cannot be written.
     """
     figures: list[dict[str, Any]] = []
-    parts = [_part(section, figures) for section in sections(study, looks)]
+    parts = [_part(section, figures) for section in sections(study, analyses)]
     template = _environment().get_template("page.html")
     page = template.render(
         title=", ".join(study.tasks),
@@ -46,13 +46,13 @@ def write_page(study: Study, looks: list[Look], out: Path) -> None:
 
 
 def _part(section: Section, figures: list[dict[str, Any]]) -> dict[str, Any]:
-    """A section for the template, which knows charts by their place in ``figures``; they are added there."""
+    """Return a section for the template; its charts are added to ``figures``, and the template knows their index."""
     shown = []
     for figure in section.figures:
         shown.append({"title": figure.title, "id": len(figures), "height": figure.height})
         figures.append({"data": figure.data, "layout": figure.layout, "choices": figure.choices})
-    own = {name: getattr(section, name) for name in _SHOWN_AS_THEY_ARE}
-    return own | {"figures": shown, "inner": [_part(inner, figures) for inner in section.inner]}
+    own = {name: getattr(section, name) for name in _PASSED_ON}
+    return own | {"figures": shown, "subsections": [_part(part, figures) for part in section.subsections]}
 
 
 def _subtitle(study: Study) -> str:
@@ -66,13 +66,13 @@ def _subtitle(study: Study) -> str:
 
 
 def _plotly_js() -> str:
-    """The script that the plotly package ships (what ``plotly.offline.get_plotlyjs`` returns, without its import)."""
+    """Return the script of the plotly package (as ``plotly.offline.get_plotlyjs``, whose import takes long)."""
     file = importlib.resources.files("plotly") / "package_data" / "plotly.min.js"
     return file.read_text(encoding="utf-8")
 
 
 def _filter(study: Study) -> list[dict[str, Any]]:
-    colours = colours_of(study)
+    colours = setting_colours(study)
     several = len(study.tasks) > 1
     return [
         {
@@ -93,7 +93,7 @@ def _filter(study: Study) -> list[dict[str, Any]]:
 
 
 def _json(content: Any) -> str:
-    """JSON that can stand in a script element: nothing in it ends the element or opens a comment."""
+    """Return JSON for a script element: nothing in it ends the element or opens a comment."""
     text = json.dumps(content, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

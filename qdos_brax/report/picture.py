@@ -1,4 +1,4 @@
-"""The picture of a task, as a PNG."""
+"""The picture of a task, as a PNG file."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from qdos_brax.files import user_errors
 
 
 def draw_task(name: str, out: Path) -> None:
-    """Draws the maze of a task from above, with the body at a start and the target at the goal.
+    """Draw the maze of a task from above, with the body at a start and the target at the goal.
 
     Args:
-        name: of the task.
-        out: the picture, ending in .png; its folder must exist.
+        name: the task's name.
+        out: the file, ending in .png; its folder must exist.
 
     Raises:
-        UserError: there is no such task, this machine cannot draw, or the picture cannot be written.
+        UserError: there is no such task, this machine cannot draw, or the file cannot be written.
     """
     if out.suffix != ".png":
         raise UserError(f"a picture is written as .png, not as {out.name}; choose another name for it")

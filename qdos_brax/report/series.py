@@ -1,4 +1,4 @@
-"""The numbers behind the figures: learning curves and scans with their intervals. How they are drawn is elsewhere."""
+"""The numbers behind the figures: learning curves and scans with their intervals."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from typing import Any
 import numpy as np
 
 from qdos_brax.report.statistics import mean_curve
-from qdos_brax.report.study import Member, Setting, Study, plain, short
+from qdos_brax.report.study import Member, Setting, Study, format_value, short_key
 
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """One measure of one setting's members over the environment steps.
+    """Hold one measure of one setting's members over the environment steps.
 
     Attributes:
-        setting: whose it is.
-        offline: nothing was played online: evaluated after training, a level rather than a curve.
+        setting: the setting.
+        offline: whether the method only learned offline, so that there is one level instead of a curve.
         steps: float[points].
         mean: float[points], over the members.
         low: float[points], the lower end of the mean's 95 % interval; nan for a single member.
         high: its upper end.
-        members: each with its own float[2, points]: steps and values.
+        members: each member with its own float[2, points]: steps and values.
     """
 
     setting: Setting
@@ -39,12 +39,12 @@ class Curve:
 
 @dataclasses.dataclass(frozen=True)
 class Scan:
-    """Final success over the values of one thing that was varied.
+    """Hold final success over the values of one hyperparameter that was varied.
 
     Attributes:
-        task: on which task.
-        key: what was varied, dotted.
-        lines: one for each choice of method and of everything else that was varied; where no two settings differ in
+        task: the task's full name.
+        key: the dotted key of the hyperparameter.
+        lines: one for each choice of method and of everything else that was varied. Where no two settings differ in
             this key alone (values drawn at random, or in pairs), one for each method, not joined.
     """
 
@@ -53,24 +53,24 @@ class Scan:
     lines: list[ScanLine]
 
     @property
-    def wide(self) -> bool:
-        """Whether the values are positive numbers over a decade or more, and want a logarithmic axis."""
+    def log_scale(self) -> bool:
+        """Return whether the values are positive numbers over a decade or more, which need a logarithmic axis."""
         values = [value for line in self.lines for value in line.values]
         return all(map(_is_number, values)) and min(values) > 0 and max(values) >= 10 * min(values)
 
 
 @dataclasses.dataclass(frozen=True)
 class ScanLine:
-    """One line of a scan.
+    """Hold one line of a scan.
 
     Attributes:
         label: the method, and what else was varied.
-        values: the values of the key, rising if they are numbers; they are evenly spaced where they are words.
+        values: the values of the key, in rising order if they are numbers.
         mean: float[values], success.
         low: the lower end of the mean's 95 % interval; nan for a single member.
         high: its upper end.
         members: the members at each value.
-        joined: whether all else is equal along it.
+        joined: whether all else is equal along it, so that its points are joined.
     """
 
     label: str
@@ -84,14 +84,14 @@ class ScanLine:
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """Final success over two things that were varied in all combinations, mean over all else.
+    """Hold final success over two hyperparameters that were varied in all combinations, mean over all else.
 
     Attributes:
-        task: on which task.
-        method: of which method.
-        keys: what was varied, dotted: along x, along y.
-        x: the values of the first, rising.
-        y: of the second.
+        task: the task's full name.
+        method: the method's name.
+        keys: the dotted keys of the hyperparameters along x and along y.
+        x: the values of the first, in rising order.
+        y: the values of the second, in rising order.
         mean: float[y, x]; nan where nothing was evaluated.
     """
 
@@ -104,9 +104,9 @@ class Surface:
 
 
 def curves(study: Study, task: str, column: str) -> list[Curve]:
-    """The curves of a column of metrics.csv, one per setting that was measured on the task.
+    """Return the curves of a column of metrics.csv, one per setting that was measured on the task.
 
-    A member that was measured at other steps than the rest is interpolated; before its first and after its last
+    A member that was measured at other steps than the others is interpolated. Before its first and after its last
     measurement it keeps that value.
     """
     found = []
@@ -121,14 +121,14 @@ def curves(study: Study, task: str, column: str) -> list[Curve]:
 
 
 def points(member: Member, column: str) -> np.ndarray:
-    """float[2, points]: environment steps and values; empty if nothing was measured. Offline, the last one counts."""
+    """Return float[2, points], a member's environment steps and values; the last value of each step counts."""
     found = {float(row["env_steps"] or 0): float(row[column]) for row in member.rows if row.get(column)}
     kept = [(step, value) for step, value in found.items() if not math.isnan(value)]
     return np.asarray(sorted(kept)).T if kept else np.empty((2, 0))
 
 
 def scans(study: Study) -> list[Scan]:
-    """Every key of which a method has several values on a task, with the success that each value led to."""
+    """Return each key of which a method has several values on a task, with the success under each value."""
     found = []
     for task in study.tasks:
         present = [setting for setting in study.settings if task in setting.members]
@@ -136,7 +136,7 @@ def scans(study: Study) -> list[Scan]:
             groups: dict[str, list[Setting]] = {}
             for setting in present:
                 if key in setting.values:
-                    rest = [f"{short(k)} {plain(v)}" for k, v in setting.values.items() if k != key]
+                    rest = [f"{short_key(k)} {format_value(v)}" for k, v in setting.values.items() if k != key]
                     groups.setdefault(", ".join([setting.method, *rest]), []).append(setting)
             lines = [_scan_line(label, group, task, key, True) for label, group in groups.items() if len(group) > 1]
             if not lines:
@@ -151,7 +151,7 @@ def scans(study: Study) -> list[Scan]:
 
 
 def surfaces(study: Study) -> list[Surface]:
-    """Every pair of keys with numbers for values of which a method has every combination on a task."""
+    """Return each pair of keys with numeric values of which a method has all combinations on a task."""
     found = []
     for task in study.tasks:
         for method in dict.fromkeys(setting.method for setting in study.settings):

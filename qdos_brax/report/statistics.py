@@ -1,8 +1,8 @@
-"""The statistics of few seeds, from scipy.
+"""Statistics for few seeds, from scipy.
 
 The measures are those of Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021):
-interquartile mean, probability of improvement, stratified bootstrap (seeds are drawn anew within each task). Their
-package ``rliable`` (1.2.0) would bring pandas, seaborn, statsmodels, arch and patsy for what is a call of scipy here.
+interquartile mean, probability of improvement, stratified bootstrap (seeds are resampled within each task). Their
+package ``rliable`` (1.2.0) depends on pandas, seaborn, statsmodels, arch and patsy; here it is one call of scipy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TRIM = 0.25
 
 
 class Estimate(NamedTuple):
-    """A number with the interval around it; nan where there is too little to tell.
+    """Hold a number with the interval around it; nan where there are too few scores.
 
     Attributes:
         value: the estimate.
@@ -34,16 +34,16 @@ class Estimate(NamedTuple):
 
 
 def mean_std(scores: Sequence[float]) -> tuple[float, float]:
-    """Mean and standard deviation over seeds, with n - 1, as in the paper's tables; nan where there are too few."""
+    """Return mean and standard deviation over seeds, with n - 1, as in the paper's tables; nan for too few scores."""
     numbers = _finite(scores)
     mean = float(numbers.mean()) if numbers.size else math.nan
     return mean, float(numbers.std(ddof=1)) if numbers.size > 1 else math.nan
 
 
 def interquartile_mean(tasks: Sequence[Sequence[float]]) -> Estimate:
-    """The mean of the middle half of all scores.
+    """Return the mean of the middle half of all scores.
 
-    Of three seeds on one task the middle half is all three (scipy trims whole scores), so that it is the mean.
+    For three seeds on one task this is the mean, because scipy trims whole scores and a quarter of three is none.
 
     Args:
         tasks: the scores of each task's seeds.
@@ -56,11 +56,11 @@ def interquartile_mean(tasks: Sequence[Sequence[float]]) -> Estimate:
 
 
 def probability_of_improvement(better: Sequence[Sequence[float]], reference: Sequence[Sequence[float]]) -> Estimate:
-    """The chance that a seed of one method scores above a seed of another (ties count half), mean over the tasks.
+    """Return the probability that a seed of one method beats a seed of another (ties count half), mean over tasks.
 
     Args:
         better: the scores of each task's seeds.
-        reference: likewise, of the same tasks.
+        reference: the scores of the other method's seeds, on the same tasks.
     """
     count = len(better)
 
@@ -71,7 +71,7 @@ def probability_of_improvement(better: Sequence[Sequence[float]], reference: Seq
 
 
 def mean_curve(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mean over seeds at every point, and the ends of its bootstrap interval.
+    """Compute the mean over seeds at every point, and the ends of its bootstrap interval.
 
     Args:
         values: float[seeds, points], finite.
@@ -87,8 +87,8 @@ def mean_curve(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _chance(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
-    """P(x > y) + P(x = y) / 2: Mann and Whitney's U over the number of pairs."""
-    with np.errstate(invalid="ignore", divide="ignore"):  # of the p-value, which nobody asked for, where all tie
+    """Return P(x > y) + P(x = y) / 2: Mann and Whitney's U over the number of pairs."""
+    with np.errstate(invalid="ignore", divide="ignore"):  # from the unused p-value if all tie
         u = stats.mannwhitneyu(x, y, axis=axis, method="asymptotic").statistic
     return np.asarray(u / (x.shape[axis] * y.shape[axis]))
 
@@ -104,7 +104,7 @@ def _bootstrapped(groups: Sequence[np.ndarray], statistic: Callable[..., np.ndar
 
 
 def _bootstrap(data: tuple[np.ndarray, ...], statistic: Callable[..., Any], axis: int = 0) -> Any:
-    """Percentile intervals, as rliable has them; the same data give the same interval every time."""
+    """Return percentile intervals, as rliable does; the seed is fixed, so that equal data have equal intervals."""
     return stats.bootstrap(
         data,
         statistic,

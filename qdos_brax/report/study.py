@@ -1,4 +1,4 @@
-"""What was run, as tables and figures want it: members of finished runs, grouped by method and by what was varied."""
+"""The study that a report is about: members of finished runs, grouped by method and by what was varied."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import Row, read_rows
 
 DATA = "data"  # the key under which a setting holds the data file's hash
-# What tells no two settings apart: the names of the task and of the method (they do that themselves), seeds and places.
+# Keys that do not make a setting: seeds, paths, and the names of task and method, by which members are grouped anyway.
 _NOT_A_SETTING = {
     "env",
     "method",
@@ -26,27 +26,27 @@ _NOT_A_SETTING = {
     "out",
     "dataset",
     *(key for key, _ in leaves(Config) if key.startswith("run.")),
-    # How members were found and run; what differs for it is among the values.
+    # How a scan's members were chosen and run; the values that it chose are among the other keys.
     "scan.combine",
     "scan.samples",
     "scan.draw_seed",
     "members_per_program",
 }
-# Where methods that are compared on one task have to agree.
+# What methods that are compared on one task should have in common.
 _BUDGET = ("preset", "physics", "high_level.env_steps", "eval.episodes", DATA)
 _MOST_NAMED = 3
 
 
 @dataclasses.dataclass(frozen=True)
 class Member:
-    """One seed with one setting, trained to its end.
+    """Hold one seed with one setting, trained to its end.
 
     Attributes:
         run: its run folder.
         task: the task's full name.
-        method: the recipe's name.
+        method: the method's name.
         seed: its seed.
-        values: by dotted key, everything in the configuration that may tell two settings apart.
+        values: by dotted key, everything in the configuration in which two settings may differ.
         success: at the last evaluation, 0 to 1; nan if it was never evaluated.
         first_goal: environment steps when the goal was first reached; nan if never.
         frozen: whether it was frozen because its numbers were no longer finite.
@@ -66,14 +66,14 @@ class Member:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One run folder.
+    """Hold what a run folder says of a finished run.
 
     Attributes:
         path: the folder.
         config: its configuration.
-        provenance: run.json; empty where there is none.
-        summary: summary.json.
-        members: in the population's order.
+        provenance: the content of run.json; empty if there is none.
+        summary: the content of summary.json.
+        members: its members, in the population's order.
     """
 
     path: Path
@@ -85,13 +85,13 @@ class Run:
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """A method with one choice of what was varied of it: one row of the tables, one colour of the figures.
+    """Hold a method with one choice of its varied hyperparameters: one row of the tables, one colour of the figures.
 
     Attributes:
-        label: "qdos" or "qdos, alpha 0.3".
-        method: the recipe's name.
-        values: what was varied, by dotted key.
-        members: by task, one per seed.
+        label: its name, such as "qdos" or "qdos, alpha 0.3".
+        method: the method's name.
+        values: the values of what was varied, by dotted key.
+        members: its members by task, one per seed.
     """
 
     label: str
@@ -102,14 +102,14 @@ class Setting:
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """Everything that one report is about.
+    """Hold everything that one report is about.
 
     Attributes:
-        runs: the run folders.
-        tasks: full names, sorted.
-        settings: in the order in which they were given.
+        runs: the runs.
+        tasks: the full names of the tasks, sorted.
+        settings: the settings, in the order in which they were given.
         reference: the setting that the others are compared with.
-        notes: what a reader must know before believing a comparison, one line each.
+        notes: warnings to a reader who compares the settings, one line each.
     """
 
     runs: list[Run]
@@ -120,21 +120,21 @@ class Study:
 
 
 def read_study(paths: Sequence[Path], reference: str | None = None) -> Study:
-    """Reads runs and comparisons.
+    """Read runs and comparisons.
 
     Args:
         paths: folders of either kind.
-        reference: the method or label to compare with; None for supe, or else the first.
+        reference: the method or label to compare with; None for supe if it was run, or the first.
 
     Raises:
-        UserError: a folder is no run, has not ended or holds nothing; two members are the same; there is no such
+        UserError: a folder is not a run, has not finished or is empty; two members are the same; there is no such
             reference.
     """
     folders = [folder for path in paths for folder in _folders(path)]
     counts = Counter(folder.path.resolve() for folder in folders)
     for path, count in counts.items():
         if count > 1:
-            raise UserError(f"{path} was given twice; name each run once")
+            raise UserError(f"{path} was given twice; give each run once")
     runs = [_read_run(folder) for folder in folders]
     settings = _settings([member for run in runs for member in run.members])
     return Study(
@@ -156,10 +156,12 @@ def _read_run(folder: RunFolder) -> Run:
     config = from_yaml(folder.config)
     summary = folder.read_summary()
     if summary is None:
-        raise UserError(f"the run in {folder.path} has not ended; go on with: python train.py --resume {folder.path}")
+        raise UserError(
+            f"the run in {folder.path} has not finished; continue it with: python train.py --resume {folder.path}"
+        )
     rows = read_rows(folder.metrics)
     if not rows:
-        raise UserError(f"{folder.metrics} holds no rows; the run cannot be reported")
+        raise UserError(f"{folder.metrics} has no rows, so there is nothing to report; leave this run out")
     provenance = _provenance(folder)
     values = {key: get(config, key) for key, _ in leaves(Config) if key not in _NOT_A_SETTING}
     values[DATA] = provenance.get("dataset", {}).get("sha256", "")[:8]
@@ -171,8 +173,8 @@ def _read_run(folder: RunFolder) -> Run:
         members = [_member(folder.path, summary, values, entry, by_member[str(i)]) for i, entry in entries]
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(
-            f"{folder.summary} does not fit {folder.metrics.name} or is damaged ({error!r}); remove it, and --resume "
-            "writes it again"
+            f"{folder.summary} does not match {folder.metrics.name} or is damaged ({error!r}); delete it, and "
+            f"--resume {folder.path} writes it again"
         ) from error
     return Run(folder.path, config, provenance, summary, members)
 
@@ -211,13 +213,13 @@ def _provenance(folder: RunFolder) -> dict[str, Any]:
 
 
 def _settings(members: Sequence[Member]) -> list[Setting]:
-    """Members of one method and of equal values belong together, whatever the run folder."""
+    """Group members with the same method and equal values, whatever their run folders."""
     varied = {method: _varied(members, method) for method in dict.fromkeys(member.method for member in members)}
     settings: dict[tuple[str, ...], Setting] = {}
     for member in members:
         values = {key: member.values[key] for key in varied[member.method]}
         named = _named(member, values, members)
-        label = ", ".join([member.method, *(f"{short(key)} {plain(value)}" for key, value in named.items())])
+        label = ", ".join([member.method, *(f"{short_key(key)} {format_value(value)}" for key, value in named.items())])
         setting = settings.setdefault((label, *map(str, values.values())), Setting(label, member.method, values, {}))
         others = setting.members.setdefault(member.task, [])
         for other in others:
@@ -229,7 +231,7 @@ def _settings(members: Sequence[Member]) -> list[Setting]:
 
 
 def _named(member: Member, values: dict[str, Any], members: Sequence[Member]) -> dict[str, Any]:
-    """What a label tells of a member: its values; of many values those that vary within its run, and the run."""
+    """Return what a label names: the values, or if they are many, the run and those that vary within it."""
     if len(values) <= _MOST_NAMED:
         return values
     others = [other for other in members if other.method == member.method]
@@ -239,7 +241,7 @@ def _named(member: Member, values: dict[str, Any], members: Sequence[Member]) ->
 
 
 def _varied(members: Sequence[Member], method: str) -> list[str]:
-    """The keys in which members of the method differ on one and the same task."""
+    """Return the keys in which members of the method differ on the same task."""
     keys: dict[str, None] = {}
     for task in dict.fromkeys(member.task for member in members):
         group = [member.values for member in members if (member.method, member.task) == (method, task)]
@@ -247,17 +249,17 @@ def _varied(members: Sequence[Member], method: str) -> list[str]:
             if any(values[key] != group[0][key] for values in group):
                 keys[key] = None
     if any(key.startswith("data.") for key in keys):
-        keys.pop(DATA, None)  # the file differs because its recipe does
+        keys.pop(DATA, None)  # the file differs because these keys do
     return list(keys)
 
 
-def short(key: str) -> str:
-    """The last word of a dotted key, in words: "advantage temperature"."""
+def short_key(key: str) -> str:
+    """Return the last part of a dotted key in words, such as "advantage temperature"."""
     return key.rpartition(".")[2].replace("_", " ")
 
 
-def plain(value: Any) -> str:
-    """A value of a configuration in few characters."""
+def format_value(value: Any) -> str:
+    """Return a value of a configuration in few characters."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -268,23 +270,20 @@ def _reference(settings: Sequence[Setting], name: str | None) -> Setting:
         if name in (setting.label, setting.method):
             return setting
     labels = [setting.label for setting in settings]
-    raise UserError(f"--reference {name}: no such method was run{nearest(name, labels)}; there are {'; '.join(labels)}")
+    raise UserError(
+        f"--reference {name}: no such method was run{nearest(name, labels)}; choose from: {'; '.join(labels)}"
+    )
 
 
 def _notes(settings: Sequence[Setting]) -> Iterable[str]:
-    """Unequal budgets, data and numbers of seeds; frozen and never evaluated members."""
+    """Yield a warning for unequal budgets, data and numbers of seeds, and for frozen and never evaluated members."""
     everyone = [member for setting in settings for members in setting.members.values() for member in members]
     for task in sorted({member.task for member in everyone}):
-        on_task = [member for member in everyone if member.task == task]
         for key in _BUDGET:
-            found: dict[str, list[str]] = {}
-            for member in on_task:
-                labels = found.setdefault(plain(member.values[key]) or "unknown", [])
-                if member.method not in labels:
-                    labels.append(member.method)
+            found = _methods_by_value([member for member in everyone if member.task == task], key)
             if len(found) > 1:
                 parts = "; ".join(f"{value}: {', '.join(methods)}" for value, methods in found.items())
-                yield f"{task}: not all had the same {short(key)} ({parts})"
+                yield f"{task}: the members differ in {short_key(key)} ({parts})"
         counts = {setting.label: len(setting.members[task]) for setting in settings if task in setting.members}
         if len(set(counts.values())) > 1:
             yield f"{task}: unequal numbers of seeds ({', '.join(f'{k}: {v}' for k, v in counts.items())})"
@@ -293,4 +292,12 @@ def _notes(settings: Sequence[Setting]) -> Iterable[str]:
         if member.frozen:
             yield f"{name} was frozen: its numbers were no longer finite; it counts with its last evaluation"
         if math.isnan(member.success):
-            yield f"{name} was never evaluated and is left out of table 1"
+            yield f"{name} was never evaluated, so table 1 leaves it out"
+
+
+def _methods_by_value(members: Sequence[Member], key: str) -> dict[str, dict[str, None]]:
+    """Return the methods, as an ordered set, of the members that have each value of a key."""
+    found: dict[str, dict[str, None]] = {}
+    for member in members:
+        found.setdefault(format_value(member.values[key]) or "unknown", {})[member.method] = None
+    return found

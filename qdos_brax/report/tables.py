@@ -1,4 +1,4 @@
-"""The paper's tables of what was run: final success, and environment steps to the first goal."""
+"""The paper's tables for the runs of a study: final success, and environment steps to the first goal."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _CsvRow = dict[str, str | float]
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Cells of text under a heading.
+    """Hold cells of text under a heading.
 
     Attributes:
         title: what the table shows.
-        header: names of the columns; the first one is that of the rows' names.
+        header: names of the columns; the first column holds the rows' names.
         rows: the cells.
         note: how to read it.
-        words: how many of the first columns hold words, not numbers.
+        words: how many columns, from the left, hold words rather than numbers.
     """
 
     title: str
@@ -35,7 +35,7 @@ class Table:
     words: int = 1
 
     def text(self) -> str:
-        """For a terminal."""
+        """Return the table for a terminal."""
         widths = [max(map(len, column)) for column in zip(self.header, *self.rows, strict=True)]
         lines = [
             "  ".join(
@@ -47,21 +47,21 @@ class Table:
         return "\n".join(line.rstrip() for line in (self.title, *lines, self.note) if line)
 
     def markdown(self) -> str:
-        """For a README."""
+        """Return the table in Markdown."""
         rule = ["---"] * self.words + ["---:"] * (len(self.header) - self.words)
         cells = [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in (self.header, rule, *self.rows)]
         return "\n\n".join(part for part in (f"**{self.title}**", "\n".join(cells), self.note) if part)
 
 
 def tables(study: Study) -> list[Table]:
-    """Table 1 (with what few seeds can say about it) and table 2."""
+    """Return table 1, its statistics over seeds, and table 2."""
     return [_success_table(study), _statistics_table(study), _first_goal_table(study)]
 
 
 def success_csv(study: Study) -> str:
-    """Table 1 in numbers, one row per setting and task, and one over all tasks where there are several.
+    """Return table 1 as CSV: one row per setting and task, and one over all tasks if there are several.
 
-    Success and its statistics are shares, 0 to 1; what there are too few seeds for is empty.
+    Success and its statistics are shares, 0 to 1; a cell is empty where there are too few seeds.
     """
     rows: list[_CsvRow] = []
     for setting, task, scores, improvement in _statistics(study):
@@ -82,7 +82,7 @@ def success_csv(study: Study) -> str:
 
 
 def first_goal_csv(study: Study) -> str:
-    """Table 2 in numbers, one row per setting and task: environment steps of the seeds that reached the goal."""
+    """Return table 2 as CSV, a row per setting and task: environment steps of the seeds that reached the goal."""
     rows: list[_CsvRow] = []
     for setting in study.settings:
         for task in study.tasks:
@@ -100,7 +100,7 @@ def _success_table(study: Study) -> Table:
         [setting.label, *(_percent(*mean_std(_scores(setting, task))) for task in study.tasks)]
         for setting in study.settings
     ]
-    note = "standard deviation over seeds, with n - 1; of one seed there is none"
+    note = "standard deviation over seeds, with n - 1; not defined for one seed"
     return Table("Table 1. Success at the last evaluation (%), mean ± std", ["method", *study.tasks], rows, note)
 
 
@@ -113,8 +113,8 @@ def _statistics_table(study: Study) -> Table:
     header = ["method", "task", "seeds", "IQM (%) [95 %]"]
     if several:
         header.append(f"P(better than {study.reference.label}) [95 %]")
-    note = "interquartile mean (of fewer than four scores: the mean); bootstrap over seeds within each task"
-    return Table("Table 1, continued. What this many seeds can say", header, rows, note, words=2)
+    note = "IQM: interquartile mean (of fewer than four scores: the mean); [95 %]: bootstrap over seeds within a task"
+    return Table("Table 1, continued. Statistics over seeds", header, rows, note, words=2)
 
 
 def _first_goal_table(study: Study) -> Table:
@@ -127,12 +127,12 @@ def _first_goal_table(study: Study) -> Table:
         return f"{words} ({len(steps)}/{seeds})"
 
     rows = [[setting.label, *(cell(setting, task) for task in study.tasks)] for setting in study.settings]
-    note = "over the seeds that reached it (how many did, of how many); those that did not are in no mean"
+    note = "mean over the seeds that reached the goal; in brackets: how many did, of how many"
     return Table("Table 2. Environment steps to the first goal, mean ± std", ["method", *study.tasks], rows, note)
 
 
 def _statistics(study: Study) -> list[tuple[Setting, str, list[list[float]], Estimate | None]]:
-    """(setting, task or all of them, scores by task, chance to beat the reference) of everything that was evaluated."""
+    """Return (setting, task or all tasks, scores by task, probability to beat the reference) of all evaluated."""
     found = []
     for setting in study.settings:
         for task in (*study.tasks, *([_ALL] if len(study.tasks) > 1 else [])):

@@ -1,4 +1,4 @@
-"""Films, as H.264 in .mp4."""
+"""Videos, as H.264 in .mp4 files."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from qdos_brax.files import user_errors
 
 @contextlib.contextmanager
 def mp4(out: Path, height: int, width: int, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Writes a film: gives the function that takes its frames uint8[height, width, 3], one by one.
+    """Write a video; yield the function that takes its frames uint8[height, width, 3], one by one.
 
-    The file appears under its name when the block ends well, and not at all if it does not.
+    The file appears when the block ends without an error, and not at all otherwise.
 
     Args:
         out: the file, ending in .mp4; its folder must exist.
-        height: of the frames; an odd one loses a row, for H.264 wants even numbers.
-        width: of the frames; likewise.
+        height: height of the frames in pixels; H.264 needs even numbers, so an odd one loses a row.
+        width: width of the frames in pixels; an odd one loses a column.
         fps: frames per second.
 
     Raises:
         UserError: imageio-ffmpeg is not installed, or the file cannot be written.
     """
     if out.suffix != ".mp4":
-        raise UserError(f"a film is written as .mp4, not as {out.name}; choose another name for it")
+        raise UserError(f"a video is written as .mp4, not as {out.name}; choose another name for it")
     ffmpeg = _ffmpeg()
-    partial = out.with_name(f".{out.stem}.partial.mp4")  # ffmpeg goes by the ending
+    partial = out.with_name(f".{out.stem}.partial.mp4")  # ffmpeg takes the format from the ending
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
     coding = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2"]
     with user_errors(out):
-        partial.touch()  # says at once, and why, if it cannot be written
+        partial.touch()  # raises at once, with the reason, if it cannot be written
         try:
-            # imageio_ffmpeg.write_frames would run Python between fork and exec, where threads such as JAX's can hang
-            # it; process_group keeps a Ctrl-C from ffmpeg without that.
+            # imageio_ffmpeg.write_frames runs Python between fork and exec, where other threads (JAX has some) can
+            # make it hang. process_group keeps Ctrl-C away from ffmpeg without that.
             with subprocess.Popen(
                 [ffmpeg, "-v", "error", "-y", *source, *coding, str(partial)],
                 stdin=subprocess.PIPE,
@@ -53,30 +53,30 @@ def mp4(out: Path, height: int, width: int, fps: float) -> Iterator[Callable[[np
                     yield lambda frame: _send(feed, frame)
                 except BaseException:
                     process.kill()
-                    with contextlib.suppress(BrokenPipeError):  # of what was still to be sent
+                    with contextlib.suppress(BrokenPipeError):  # some frames may still be unsent
                         feed.close()
                     raise
-                _, said = process.communicate()
+                _, errors = process.communicate()
             if process.returncode:
-                raise UserError(f"cannot write {out}: ffmpeg says {' '.join(said.decode(errors='replace').split())}")
+                raise UserError(f"cannot write {out}: ffmpeg says {' '.join(errors.decode(errors='replace').split())}")
             os.replace(partial, out)
         finally:
             partial.unlink(missing_ok=True)
 
 
 def _send(feed: IO[bytes], frame: np.ndarray) -> None:
-    with contextlib.suppress(BrokenPipeError):  # ffmpeg has stopped; why, it says at the end
+    with contextlib.suppress(BrokenPipeError):  # ffmpeg has stopped; its reason is read at the end
         feed.write(np.ascontiguousarray(frame, np.uint8).tobytes())
 
 
 def _ffmpeg() -> str:
-    """The path of ffmpeg."""
+    """Return the path of ffmpeg."""
     try:
         import imageio_ffmpeg
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except (ImportError, RuntimeError) as error:  # RuntimeError: there is none for this kind of machine
+    except (ImportError, RuntimeError) as error:  # RuntimeError: no ffmpeg for this kind of machine
         raise UserError(
-            f'films need ffmpeg ({error}); run: pip install -c constraints.txt -e ".[video]", '
+            f'videos need ffmpeg ({error}); run: pip install -c constraints.txt -e ".[video]", '
             "or set IMAGEIO_FFMPEG_EXE to an ffmpeg of your own"
         ) from error

@@ -1,4 +1,4 @@
-"""A look inside a finished run: numbers of a data set made by hand, skills from one start, and the page."""
+"""The analysis of a finished run: numbers of a data set made by hand, skills from one start, and the page."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from envs import render
 from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.analysis import inside
 from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
-from qdos_brax.report.inside_sections import inside_sections
-from qdos_brax.report.looks import read_looks
+from qdos_brax.report.analysis_sections import analysis_sections
+from qdos_brax.report.member_analysis import read_analyses
 from qdos_brax.report.page import write_page
 from qdos_brax.report.study import read_study
 
@@ -75,6 +76,7 @@ def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
     expected = [left[0] - left[1], *[left[1] - left[2]] * 3]
     np.testing.assert_allclose(found["gain"][[0, 10, 21, 32]], expected, atol=1e-4)
     assert found["quality"].tolist() == [0] * 11 + [1] * 11 + [2] * 11
+    assert {name: code for code, name in enumerate(found["quality_names"])} == QUALITY
     mean = (segments - 1 + 10) / segments
     np.testing.assert_allclose(found["0/weight"], [(10 if i == 1 else 1) / mean for i in range(segments)], rtol=1e-5)
     assert found["0/latent"].shape == (segments, 8) and found["0/tsne"].shape == (segments, 2)
@@ -92,20 +94,20 @@ def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
 
     written_as_finished(looked)
     study = read_study([looked])
-    looks, _ = read_looks(study)
-    sections = {section.title: section for section in inside_sections(looks)}
+    analyses, _ = read_analyses(study)
+    sections = {section.title: section for section in analysis_sections(analyses)}
     titles = ["Weight against quality", "Latents of segments (t-SNE)", "Where skills lead", "Skills over an episode"]
     assert list(sections) == titles
     dots = sections["Weight against quality"].figures[0].data
-    assert [trace["name"] for trace in dots] == ["good", "noisy", "wandering"]
+    assert [trace["name"] for trace in dots] == ["navigate", "noisy", "wander"]
     assert dots[0]["y"][1] == pytest.approx(10 / mean, rel=1e-4)
     assert len(sections["Where skills lead"].figures[0].data) == 25 + 1
-    assert len(sections["Skills over an episode"].inner[0].images) == (6 if opengl_or_not else 0)
-    write_page(study, looks, looked / "report.html")
+    assert len(sections["Skills over an episode"].subsections[0].images) == (6 if opengl_or_not else 0)
+    write_page(study, analyses, looked / "report.html")
     assert (looked / "report.html").read_text().count("data:image/jpeg;base64,") == (6 if opengl_or_not else 0)
 
     (looked / "inside.npz").write_bytes((looked / "inside.npz").read_bytes()[:1000])
-    assert read_looks(study)[0] == [] and "remove it" in read_looks(study)[1][0]
+    assert read_analyses(study)[0] == [] and "delete it" in read_analyses(study)[1][0]
 
 
 @pytest.fixture

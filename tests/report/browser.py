@@ -1,4 +1,4 @@
-"""A browser for tests, headless, driven as a user does it, over WebDriver (which is HTTP and JSON)."""
+"""A headless browser for tests, driven as a user drives it, over WebDriver (HTTP and JSON)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ DRIVER = shutil.which("chromedriver")
 
 
 class Browser:
-    """An open window.
+    """Hold an open window.
 
     Args:
-        address: of chromedriver.
-        width: of the window, in pixels.
+        address: the address of chromedriver.
+        width: width of the window, in pixels.
     """
 
     def __init__(self, address: str, width: int) -> None:
@@ -36,20 +36,20 @@ class Browser:
         self._call("/goog/cdp/execute", {"cmd": "Emulation.setDeviceMetricsOverride", "params": metrics})
 
     def open(self, page: Path) -> float:
-        """Opens a page; the seconds until it was loaded and its scripts had run."""
+        """Open a page; return the seconds until it was loaded and its scripts had run."""
         began = time.perf_counter()
         self._call("/url", {"url": f"file://{page}"})
         return time.perf_counter() - began
 
     def run(self, script: str, *arguments: Any) -> Any:
-        """What a script returns."""
+        """Run a script and return what it returns."""
         return self._call("/execute/sync", {"script": script, "args": arguments})
 
     def wait(self, script: str) -> Any:
-        """What a script returns once that is true.
+        """Run a script until what it returns is true, and return that.
 
         Raises:
-            TimeoutError: it does not become so within a minute.
+            TimeoutError: it does not become true within a minute.
         """
         end = time.perf_counter() + 60
         while time.perf_counter() < end:
@@ -59,14 +59,14 @@ class Browser:
         raise TimeoutError(script)
 
     def point(self, x: float, y: float, click: bool = False) -> None:
-        """Moves the mouse there, in pixels of the window, and clicks."""
-        moves: list[dict[str, Any]] = [{"type": "pointerMove", "x": round(x), "y": round(y), "duration": 50}]
+        """Move the mouse to a point, in pixels of the window, and click there if asked to."""
+        moves: list[dict[str, Any]] = [{"type": "pointerMove", "x": round(x), "y": round(y), "format_duration": 50}]
         if click:
             moves += [{"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}]
         self._call("/actions", {"actions": [{"type": "pointer", "id": "mouse", "actions": moves}]})
 
     def click(self, selector: str) -> None:
-        """Clicks in the middle of what a CSS selector finds first."""
+        """Click in the middle of the first element that a CSS selector finds."""
         box = self.run(
             "const found = document.querySelector(arguments[0]); found.scrollIntoView({block: 'center'});"
             "const box = found.getBoundingClientRect(); return [box.x + box.width / 2, box.y + box.height / 2]",
@@ -74,22 +74,26 @@ class Browser:
         )
         self.point(*box, click=True)
 
-    def said(self) -> list[str]:
-        """The console's warnings and errors."""
+    def console(self) -> list[str]:
+        """Return the console's warnings and errors."""
         return [entry["message"] for entry in self._call("/se/log", {"type": "browser"})]
 
     def requested(self) -> list[str]:
-        """The addresses of everything that was asked for."""
+        """Return the addresses of all requests."""
         events = [json.loads(e["message"])["message"] for e in self._call("/se/log", {"type": "performance"})]
         return [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
+
+    def close(self) -> None:
+        """Close the window."""
+        _call("DELETE", self._address, None)
 
     def _call(self, path: str, body: Any) -> Any:
         return _call("POST", self._address + path, body)
 
 
 @contextlib.contextmanager
-def browser(width: int) -> Iterator[Browser]:
-    """A window that is closed in the end."""
+def running_driver() -> Iterator[str]:
+    """Start chromedriver, yield its address once it answers, and stop it in the end."""
     assert DRIVER is not None
     port = free_port()
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -101,13 +105,24 @@ def browser(width: int) -> Iterator[Browser]:
                     _call("GET", f"{address}/status", None)
                     break
                 time.sleep(0.1)
-            window = Browser(address, width)
-            try:
-                yield window
-            finally:
-                _call("DELETE", window._address, None)
+            yield address
         finally:
             driver.terminate()
+
+
+@contextlib.contextmanager
+def browser(address: str, width: int) -> Iterator[Browser]:
+    """Open a window of a running chromedriver, and close it in the end.
+
+    Args:
+        address: the address of chromedriver.
+        width: width of the window, in pixels.
+    """
+    window = Browser(address, width)
+    try:
+        yield window
+    finally:
+        window.close()
 
 
 def _call(method: str, url: str, body: Any) -> Any:

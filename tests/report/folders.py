@@ -1,4 +1,4 @@
-"""Run folders written by hand: known successes and first goals, so that every number of a report can be told before."""
+"""Run folders written by hand: known successes and first goals, so that every number of a report is known."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def write_run(
     frozen: Sequence[int] = (),
     more: str = "",
 ) -> Path:
-    """One finished run.
+    """Write the folder of a finished run.
 
     Args:
-        path: its folder.
-        method: the recipe's name.
-        success: final success by seed, of alpha 0.2 or by alpha; the curve rises to it linearly in steps.
+        path: the folder.
+        method: the method's name.
+        success: final success by seed, of alpha 0.2 or by alpha; the curve rises to it linearly.
         env: the task.
-        seeds: their numbers; None for 0, 1, ..
+        seeds: the seeds; None for 0, 1, ..
         first_goals: by member, seeds first as in a product of seeds and alphas.
         data: SHA-256 of the data file.
         frozen: members whose numbers were no longer finite.

@@ -1,7 +1,8 @@
-"""The page of a nine-member scan in a real browser, where there is one: mouse, filter, switches, and how it fits."""
+"""The page of a nine-member scan in a real browser, if there is one: mouse, filter, switches, and widths."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from qdos_brax.report.write import write_report
-from tests.report.browser import CHROMIUM, DRIVER, Browser, browser
+from tests.report.browser import CHROMIUM, DRIVER, Browser, browser, running_driver
 from tests.report.folders import write_run
 
 pytestmark = [
@@ -26,7 +27,7 @@ SHOWN = f"return {CURVES}.querySelector('.chart').data.filter(t => t.visible && 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three alphas by three seeds, one member frozen, and 600 segments looked at."""
+    """A page of three alphas by three seeds, with one frozen member and 600 analysed segments."""
     folder = tmp_path_factory.mktemp("page")
     goals = [100, None, 300, 400, 500, 600, None, 800, 900]
     success = {0.1: [0.5, 0.6, 0.4], 0.2: [0.7, 0.8, 0.9], 0.3: [0.3, 0.2, 0.1]}
@@ -37,6 +38,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "members": np.arange(3), "goal": np.array([20.0, 20.0]), "walls": np.asarray(grid),
         "return": rng.normal(size=segments), "gain": rng.normal(size=segments),
         "quality": rng.integers(0, 4, segments),
+        "quality_names": np.asarray(["navigate", "noisy", "wander", "fail"]),
     }  # fmt: skip
     for i in range(3):
         own = {
@@ -52,53 +54,70 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_report([run], folder / "out").page
 
 
-def test_it_opens_at_once(page: Path) -> None:
-    """Wall time, and so of an idle machine."""
+@pytest.fixture(scope="session")
+def driver() -> Iterator[str]:
+    """The address of a running chromedriver."""
+    with running_driver() as address:
+        yield address
+
+
+@pytest.fixture(scope="module", params=[1280, 420], ids="width {}".format)
+def walked(request: pytest.FixtureRequest, driver: str, page: Path) -> Iterator[tuple[Browser, int]]:
+    """A window of some width in which the page was read to its end, and that width."""
+    with browser(driver, request.param) as window:
+        window.open(page)
+        _walk(window)
+        yield window, request.param
+
+
+def test_it_opens_at_once(page: Path, driver: str) -> None:
+    """A limit of wall time, for an idle machine."""
     assert page.stat().st_size < 10_000_000
-    with browser(1280) as window:
+    with browser(driver, 1280) as window:
         assert window.open(page) < 3
 
 
-def test_page_in_a_browser(page: Path) -> None:
-    with browser(1280) as window:
+def test_page_in_a_browser(page: Path, driver: str) -> None:
+    with browser(driver, 1280) as window:
         window.open(page)
         _walk(window)
         _hover(window)
         _filter(window)
         _switch_colours(window)
-        assert window.said() == []
+        assert window.console() == []
         requested = window.requested()
         assert requested and {address[:5] for address in requested} <= {"file:", "data:", "blob:"}
 
 
-@pytest.mark.parametrize("width", [1280, 420])
 @pytest.mark.parametrize("part", ["document.documentElement", "...document.querySelectorAll('.chart')"])
-def test_nothing_hangs_over_the_edge(page: Path, width: int, part: str) -> None:
-    with browser(width) as window:
-        window.open(page)
-        _walk(window)
-        wide = f"return [{part}].filter(x => x.scrollWidth > x.clientWidth + 1).length"
-        assert window.run(wide) == 0
-        assert window.run("return innerWidth") == width and window.said() == []
+def test_nothing_hangs_over_the_edge(walked: tuple[Browser, int], part: str) -> None:
+    window, width = walked
+    wide = f"return [{part}].filter(x => x.scrollWidth > x.clientWidth + 1).length"
+    assert window.run(wide) == 0
+    assert window.run("return innerWidth") == width
 
 
-def test_an_error_or_a_request_would_be_seen(tmp_path: Path) -> None:
+def test_reading_the_page_to_its_end_gives_no_error(walked: tuple[Browser, int]) -> None:
+    assert walked[0].console() == []
+
+
+def test_an_error_or_a_request_would_be_seen(tmp_path: Path, driver: str) -> None:
     (tmp_path / "wrong.html").write_text("<img src='http://127.0.0.1:9/x.png'><script>nonsense()</script>")
-    with browser(1280) as window:
+    with browser(driver, 1280) as window:
         window.open(tmp_path / "wrong.html")
-        assert any("nonsense" in line for line in window.said())
+        assert any("nonsense" in line for line in window.console())
         assert any(address.startswith("http:") for address in window.requested())
 
 
 def _walk(window: Browser) -> None:
-    """Reads the page down to its end, with every part unfolded: each chart draws itself when it comes near."""
+    """Read the page down to its end, with every part unfolded: a chart is drawn when it comes near."""
     window.run("document.querySelectorAll('main details').forEach(part => { part.open = true; })")
     window.wait("const next = charts.find(c => !c.dataset.drawn); next?.scrollIntoView(); return !next")
     window.wait("return charts.every(chart => chart.querySelector('.main-svg'))")
 
 
 def _hover(window: Browser) -> None:
-    """The mouse over the mean of alpha 0.2 half way shows its value, the mean of 0.35, 0.4 and 0.45."""
+    """Point at the mean of alpha 0.2 half way: it shows its value, the mean of 0.35, 0.4 and 0.45."""
     at = window.run(
         f"const chart = {CURVES}.querySelector('.chart'); chart.scrollIntoView({{block: 'center'}});"
         "const box = chart.getBoundingClientRect(), full = chart._fullLayout;"
@@ -120,7 +139,7 @@ def _filter(window: Browser) -> None:
     assert window.run("return document.getElementById('shown').textContent") == "8 of 9"
     window.click("input[data-setting]")
     assert {name for name in everyone if "alpha 0.1" not in name} == set(window.run(SHOWN))
-    # What shows hidden members alone goes as a whole: their latents, maps and episodes.
+    # Charts that only show hidden members disappear as a whole: their latents, maps and episodes.
     assert window.run("return [...document.querySelectorAll('.box[hidden]')].length") >= 4
     window.click("input[data-setting]")
     assert set(window.run(SHOWN)) == everyone
@@ -129,7 +148,7 @@ def _filter(window: Browser) -> None:
 
 
 def _switch_colours(window: Browser) -> None:
-    """One button changes the colour of every method's latents."""
+    """Press one button: it changes the colour of every method's latents."""
     colour = "return document.querySelector('section:has([data-choice]) .chart').data[0].marker.color[0]"
     before = window.run(colour)
     assert before in (0, 1, 2, 3)

@@ -1,4 +1,4 @@
-"""The page stands alone: nothing is fetched, everything is inside, and what it holds are the runs' numbers."""
+"""The page is self-contained: it loads nothing, and its numbers are those of the runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.report.folders import write_run
 
 
 class Page(HTMLParser):
-    """The elements of a page, and what stands in its scripts."""
+    """Hold the elements of a page and the content of its scripts."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -126,7 +126,7 @@ def test_foreign_names_stay_text(tmp_path: Path) -> None:
 
 
 def test_a_frozen_member_is_marked(tmp_path: Path) -> None:
-    """Where it is filtered, at the end of its curve, and in every chart that has a point of its own for it."""
+    """It is marked in the filter, at the end of its curve, and in every chart with a point of its own."""
     run = write_run(tmp_path / "a", success={0.1: [0.5, 0.6], 0.3: [0.7, 0.8]}, frozen=[2])
     write_page(read_study([run]), [], tmp_path / "report.html")
     parsed = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -141,7 +141,7 @@ def test_a_frozen_member_is_marked(tmp_path: Path) -> None:
 
 
 def _of(page: Page, title: str) -> list[dict[str, Any]]:
-    """The traces of the first chart with a title."""
+    """Return the traces of the first chart with a title."""
     places = [int(str(a["data-figure"])) for _, a in page.elements if "data-figure" in a]
     titles = [page.titles.get(i) for i in range(len(places))]
     data: list[dict[str, Any]] = json.loads(page.scripts[0])[places[titles.index(title)]]["data"]

@@ -1,4 +1,4 @@
-"""What is read from run folders, how members are grouped, and one clear line for what cannot be reported."""
+"""Reading run folders, grouping their members, and one clear line for what cannot be reported."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from qdos_brax.commands import cli
-from qdos_brax.report.headlines import cards
 from qdos_brax.report.series import curves, scans, surfaces
 from qdos_brax.report.study import read_study
+from qdos_brax.report.summary_cards import summary_cards
 from qdos_brax.report.tables import tables
 from qdos_brax.report.write import write_report
 from qdos_brax.runs import comparison
@@ -41,7 +41,7 @@ def test_members_are_told_apart_by_what_was_varied(tmp_path: Path) -> None:
 
 
 def test_tasks_have_alphas_of_their_own(tmp_path: Path) -> None:
-    """What differs between tasks alone is no variation: one row, as in the paper's table."""
+    """A key that differs only between tasks was not varied: one row, as in the paper's table."""
     a = write_run(tmp_path / "a", success={0.3: [0.5]})
     b = write_run(tmp_path / "b", success={0.1: [0.9]}, env="antsoccer-arena-task4")
     assert labels(a, b) == {"qdos": 2}
@@ -109,7 +109,7 @@ def test_scan_by_hand(tmp_path: Path) -> None:
 
 
 def vary(run: Path, **values: list[float]) -> Path:
-    """Gives the members of a run more that was varied."""
+    """Give the members of a run more hyperparameters that were varied."""
     summary = json.loads((run / "summary.json").read_text())
     for i, member in enumerate(summary["members"]):
         member |= {f"skills.{key}": own[i] for key, own in values.items()}
@@ -118,12 +118,12 @@ def vary(run: Path, **values: list[float]) -> Path:
 
 
 def test_values_drawn_at_random_make_no_line(tmp_path: Path) -> None:
-    """No two settings differ in one key alone: their points stand for themselves, on a logarithmic axis."""
+    """No two settings differ in one key alone, so their points are not joined; the axis is logarithmic."""
     run = write_run(tmp_path / "a", success={0.1: [0.5], 0.2: [0.7], 0.3: [0.9]})
     study = read_study([vary(run, kl_weight=[0.02, 3.0, 0.5])])
     weight, alpha = scans(study)
     assert (alpha.key, weight.key) == ("skills.alpha", "skills.kl_weight")
-    assert not alpha.wide and weight.wide and not weight.lines[0].joined
+    assert not alpha.log_scale and weight.log_scale and not weight.lines[0].joined
     assert weight.lines[0].values == [0.02, 0.5, 3.0] and weight.lines[0].mean.tolist() == [0.5, 0.9, 0.7]
     assert surfaces(study) == []
 
@@ -138,21 +138,21 @@ def test_every_combination_of_two_makes_a_surface(tmp_path: Path) -> None:
     assert [len(scan.lines) for scan in scans(study)] == [2, 2] and scans(study)[0].lines[0].joined
 
 
-def test_headlines_by_hand(tmp_path: Path) -> None:
+def test_summary_cards_by_hand(tmp_path: Path) -> None:
     q = write_run(tmp_path / "q", success=[0.9, 0.8, 1.0], first_goals=[10_000, 20_000, 30_000])
     s = write_run(tmp_path / "s", "supe", [0.2, 0.4, 0.3], first_goals=[5_000, None, None])
-    best, sure, fastest, time = cards(read_study([q, s]))
+    best, sure, fastest, time = summary_cards(read_study([q, s]))
     assert best.value == "qdos" and "90 % (95 % interval of the mean: 80 to 100 %)" in best.text
-    assert sure.value == "ahead of the next" and "chance of 1.00" in sure.text and "too narrow" in sure.text
-    # supe's one seed was faster, but two of its three never got there.
+    assert sure.value == "better than the next" and "probability 1.00" in sure.text and "too narrow" in sure.text
+    # One seed of supe was faster, but two of its three never reached the goal.
     assert fastest.value == "qdos" and fastest.text.startswith("20,000 ") and "3 of 3" in fastest.text
     assert time.value == "13.3 min" and time.text == "6 members: 2.2 min each, 45 % of it online."
     even = write_run(tmp_path / "e", "supe", [0.9, 0.8, 1.0])
-    best, sure, fastest, _ = cards(read_study([q, even]))
-    assert "2 settings" in best.value and sure.value == "not told apart"
-    assert sure.text.startswith("No difference was seen between qdos and supe (95 % interval of the chance")
+    best, sure, fastest, _ = summary_cards(read_study([q, even]))
+    assert "2 settings" in best.value and sure.value == "no clear difference"
+    assert sure.text.startswith("No difference was found between qdos and supe (95 % interval of the probability")
     nothing = write_run(tmp_path / "n", success=[0.0])
-    best, sure, fastest, _ = cards(read_study([nothing]))
+    best, sure, fastest, _ = summary_cards(read_study([nothing]))
     assert (best.value, fastest.value) == ("none", "none") and "nothing to compare" in sure.text
 
 
@@ -164,8 +164,8 @@ def test_a_reader_is_warned(tmp_path: Path) -> None:
     (c / "summary.json").write_text(text.replace('"ok"', '"nan"'))
     notes = read_study([a, b, c]).notes
     assert len(notes) == 4
-    assert "not all had the same env steps (200000: qdos; 9000: supe)" in notes[0]
-    assert "not all had the same data (dddddddd: qdos; eeeeeeee: supe)" in notes[1]
+    assert "the members differ in env steps (200000: qdos; 9000: supe)" in notes[0]
+    assert "the members differ in data (dddddddd: qdos; eeeeeeee: supe)" in notes[1]
     assert "a (qdos, seed 1) was never evaluated" in notes[2] and "c (supe, seed 4) was frozen" in notes[3]
     assert "unequal numbers of seeds (qdos: 2, supe: 1)" in read_study([a, b]).notes[2]
 
@@ -174,17 +174,17 @@ def test_a_reader_is_warned(tmp_path: Path) -> None:
     ("broken", "message"),
     [
         ("none", "is not a run folder"),
-        ("unfinished", "has not ended; go on with: python train.py --resume"),
-        ("empty", "holds no rows"),
+        ("unfinished", "has not finished; continue it with: python train.py --resume"),
+        ("empty", "has no rows"),
         ("no metrics", "cannot read"),
         ("cut summary", "cannot read"),
-        ("foreign summary", "does not fit metrics.csv or is damaged"),
-        ("fewer rows", "does not fit metrics.csv or is damaged"),
+        ("foreign summary", "does not match metrics.csv or is damaged"),
+        ("fewer rows", "does not match metrics.csv or is damaged"),
         ("cut provenance", "cannot read"),
         ("wrong config", "unknown key 'sed', did you mean 'seed'?"),
         ("twice", "was given twice"),
         ("copy", "both hold qdos, seed 0 on antmaze-medium-task1; leave one out"),
-        ("comparison", "has not ended; go on with"),
+        ("comparison", "has not finished; continue it with"),
         ("reference", "--reference spue: no such method was run, did you mean 'supe'?"),
         ("file in the way", "--out"),
     ],

@@ -1,0 +1,294 @@
+"""The sections of the page on what a run has learned: its segment weights, its latents, its skills, an episode."""
+
+from __future__ import annotations
+
+import base64
+import colorsys
+import io
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+
+from qdos_brax.report.elements import (
+    PALETTE,
+    Figure,
+    Image,
+    Section,
+    Trace,
+    axis_layout,
+    json_numbers,
+    log_axis,
+    member_id,
+)
+from qdos_brax.report.member_analysis import (
+    WALL_COLOUR,
+    MemberAnalysis,
+    maze_extent,
+    quality_colours,
+    quality_groups,
+    quality_names,
+)
+
+PROGRESS = "progress (decrease of the distance to the goal)"
+DISTANCE = "distance left to the goal"
+SKILL_SETS = (("grid", "a grid of skills"), ("between", "from one skill to another"))
+_COLOUR_BY = ("quality", "progress", "return", "weight")
+_PLAIN_MARKER = {"size": 6, "opacity": 0.6, "color": "#9aa1aa", "showscale": False}  # of what is not known
+_COLOUR_BAR = {"thickness": 10, "outlinewidth": 0}
+_SQUARE = 430  # pixels, the height of a map
+
+
+def analysis_sections(analyses: list[MemberAnalysis]) -> list[Section]:
+    """Return the sections that have something to show; arrays that a task or a method cannot give leave theirs out."""
+    made = (_weights(analyses), _latents(analyses), _skill_paths(analyses), _episodes(analyses))
+    return [section for section in made if section.figures or section.subsections]
+
+
+def skill_colours(name: str, count: int) -> list[str]:
+    """Return the colours of the paths of a set of skills.
+
+    A grid is coloured by the direction from its middle, which is grey; other sets go from blue to orange.
+
+    Args:
+        name: of the set, one of ``SKILL_SETS``.
+        count: its number of skills.
+    """
+    if name == "grid":
+        ticks = np.linspace(-1, 1, round(count**0.5))
+        return [_by_direction(x, y) for y in ticks for x in ticks]
+    first, last = np.array([0, 114, 178]), np.array([230, 159, 0])
+    return [_hex(first + (last - first) * share) for share in np.linspace(0, 1, count)]
+
+
+# --- Segments of the data --------------------------------------------------------------------------------------
+
+
+def _weights(analyses: list[MemberAnalysis]) -> Section:
+    """Return a chart per member: weight over true progress, coloured by the behaviour that produced the segment."""
+    text = (
+        "Each dot is a random segment of the data: its weight in skill learning over the true progress that it made "
+        "towards the goal. Weights that follow the quality of segments rise to the right."
+    )
+    figures = [_weight_chart(a) for a in analyses if "weight" in a.own and "gain" in a.data]
+    return Section("Weight against quality", text, figures=figures)
+
+
+def _weight_chart(analysis: MemberAnalysis) -> Figure:
+    weight, gain = analysis.own["weight"], analysis.data["gain"]
+    groups = quality_groups(analysis, len(gain))
+    data = [_dots(gain[chosen], weight[chosen], colour, name, analysis) for chosen, colour, name in groups]
+    layout = axis_layout(PROGRESS, "weight")
+    layout["yaxis"] |= log_axis(weight)
+    return Figure(analysis.label, data, layout)
+
+
+def _latents(analyses: list[MemberAnalysis]) -> Section:
+    markers = [(analysis, _markers(analysis)) for analysis in analyses if "tsne" in analysis.own]
+    known = [name for name in _COLOUR_BY if any(name in own for _, own in markers)]
+    text = (
+        "The same random segments of the data as each method's encoder represents them, laid out by t-SNE. Choose what "
+        "the colour shows: the behaviour that produced a segment, its progress towards the goal, its return or its "
+        "weight. Grey: not known."
+    )
+    figures = [_latent_chart(analysis, own, known) for analysis, own in markers]
+    return Section("Latents of segments (t-SNE)", text, figures=figures, choices=known)
+
+
+def _latent_chart(analysis: MemberAnalysis, markers: dict[str, dict[str, Any]], known: list[str]) -> Figure:
+    x, y = analysis.own["tsne"].T
+    trace = _dots(x, y, PALETTE[0], "segment", analysis) | {"marker": next(iter(markers.values()), _PLAIN_MARKER)}
+    if facts := _facts(analysis):
+        trace |= {"customdata": facts, "hovertemplate": "%{customdata}<extra></extra>"}
+    layout = axis_layout("", "") | {"margin": {"l": 14, "r": 10, "t": 14, "b": 14}}
+    for axis in ("xaxis", "yaxis"):
+        layout[axis] |= {"showticklabels": False, "zeroline": False}
+    choices = {name: {"marker": markers.get(name, _PLAIN_MARKER)} for name in known}
+    return Figure(analysis.label, [trace], layout, choices, _SQUARE)
+
+
+def _markers(analysis: MemberAnalysis) -> dict[str, dict[str, Any]]:
+    """Return plotly's markers by what colours the segments."""
+    found = {}
+    common = {"size": 6, "opacity": 0.8}
+    if names := quality_names(analysis):
+        count, colours = len(names), quality_colours(analysis)
+        edges = [[at, colour] for i, colour in enumerate(colours) for at in (i / count, (i + 1) / count)]
+        scale = {"colorscale": edges, "cmin": -0.5, "cmax": count - 0.5}
+        bar = _COLOUR_BAR | {"tickvals": list(range(count)), "ticktext": names}
+        found["quality"] = {**common, **scale, "color": json_numbers(analysis.data["quality"]), "colorbar": bar}
+    for name, measure in _measures(analysis).items():
+        if np.isfinite(measure).any():
+            low, high = np.nanquantile(measure, [0.02, 0.98])
+            scale = {"colorscale": "Viridis", "cmin": float(low), "cmax": float(high)}
+            found[name] = {**common, **scale, "color": json_numbers(measure), "colorbar": _COLOUR_BAR}
+    return found
+
+
+def _measures(analysis: MemberAnalysis) -> dict[str, np.ndarray]:
+    """Return the numbers that are known of the segments, by name."""
+    data = analysis.data
+    found = {"progress": data.get("gain"), "return": data.get("return"), "weight": analysis.own.get("weight")}
+    return {name: measure for name, measure in found.items() if measure is not None}
+
+
+def _facts(analysis: MemberAnalysis) -> list[str]:
+    """Return everything that is known of each segment, in words; [] if nothing is."""
+    words = [[f"{name} {value:.3g}" for value in measure] for name, measure in _measures(analysis).items()]
+    if names := quality_names(analysis):
+        words.insert(0, [names[code] for code in analysis.data["quality"]])
+    return ["<br>".join(of_one) for of_one in zip(*words, strict=True)]
+
+
+# --- Skills ----------------------------------------------------------------------------------------------------
+
+
+def _skill_paths(analyses: list[MemberAnalysis]) -> Section:
+    figures = [
+        _skill_map(analysis, name, words) for analysis in analyses for name, words in SKILL_SETS if name in analysis.own
+    ]
+    text = (
+        "Each line is one skill, kept for the length of three segments from the task's start; the dot is its end. A "
+        "grid of skills: along the two directions in which the latents of the data vary most, up to two standard "
+        "deviations; the hue is the direction from the middle of the grid. From one skill to another: on a straight "
+        "line between the latents of two segments of the data, from blue to orange. Drag over a part of the map to "
+        "enlarge it."
+    )
+    return Section("Where skills lead", text, figures=figures)
+
+
+def _skill_map(analysis: MemberAnalysis, name: str, words: str) -> Figure:
+    paths = analysis.own[name]
+    colours = skill_colours(name, len(paths))
+    data = [_path(path, colours[i], f"skill {i + 1} of {len(paths)}", analysis) for i, path in enumerate(paths)]
+    return Figure(f"{words}: {analysis.label}", [*data, *_goal(analysis)], _map_layout(analysis), height=_SQUARE)
+
+
+def _episodes(analyses: list[MemberAnalysis]) -> Section:
+    found = [(analysis, _episode_charts(analysis), _images(analysis)) for analysis in analyses]
+    shown = [(analysis.label, charts, images) for analysis, charts, images in found if charts or images]
+    text = (
+        "The first evaluation episode of each member: the latent of each decision, the distance left to the goal, the "
+        "path, and the scene at the marked steps, as far as the task has them."
+    )
+    parts = [
+        Section(label, figures=charts, images=images, expanded=i == 0)
+        for i, (label, charts, images) in enumerate(shown)
+    ]
+    return Section("Skills over an episode", text, subsections=parts)
+
+
+def _episode_charts(analysis: MemberAnalysis) -> list[Figure]:
+    figures = []
+    if "latents" in analysis.own:
+        figures.append(_skills_over_time(analysis))
+    if "left" in analysis.own:
+        figures.append(_distance_over_time(analysis))
+    if "path" in analysis.own:
+        data = [_path(analysis.own["path"], PALETTE[0], "path", analysis), *_goal(analysis)]
+        figures.append(Figure("path", data, _map_layout(analysis), height=_SQUARE))
+    return figures
+
+
+def _skills_over_time(analysis: MemberAnalysis) -> Figure:
+    """Return the latents of an episode, dimension by dimension, at the steps at which they were chosen."""
+    latents = analysis.own["latents"]
+    period = int(analysis.member.values["skills.horizon"])
+    largest = float(np.abs(latents).max())
+    heat = {
+        "type": "heatmap",
+        "x": [period * i for i in range(len(latents))],
+        "z": [json_numbers(column) for column in latents.T],
+        "colorscale": "RdBu",
+        "zmin": -largest,
+        "zmax": largest,
+        "colorbar": _COLOUR_BAR | {"title": {"text": "z"}},
+        "name": "z",
+        "hovertemplate": "step %{x}, dimension %{y}: %{z:.2f}<extra></extra>",
+        "meta": {"member": member_id(analysis.member)},
+    }
+    layout = axis_layout("environment steps", "dimension of the latent")
+    return Figure("skills over time", [heat], layout)
+
+
+def _distance_over_time(analysis: MemberAnalysis) -> Figure:
+    left = analysis.own["left"]
+    data = [_path(np.stack([np.arange(len(left)), left], axis=1), PALETTE[0], DISTANCE, analysis)]
+    if steps := [step for step, _ in _frames(analysis)]:
+        data.append(_dots(np.asarray(steps), left[steps], PALETTE[1], "picture", analysis) | {"showlegend": False})
+    layout = axis_layout("environment steps", "distance")
+    layout["yaxis"] |= {"rangemode": "tozero"}
+    return Figure(DISTANCE, data, layout)
+
+
+def _images(analysis: MemberAnalysis) -> list[Image]:
+    return [Image(f"step {step}", _jpeg(frame)) for step, frame in _frames(analysis)]
+
+
+def _frames(analysis: MemberAnalysis) -> list[tuple[int, np.ndarray]]:
+    """Return (step, uint8[height, width, 3]) of each picture of the episode."""
+    if not {"frames", "frame_steps"} <= set(analysis.own):
+        return []
+    return list(zip(map(int, analysis.own["frame_steps"]), analysis.own["frames"], strict=True))
+
+
+# --- Traces ----------------------------------------------------------------------------------------------------
+
+
+def _dots(x: np.ndarray, y: np.ndarray, colour: str, name: str, analysis: MemberAnalysis) -> Trace:
+    marker = {"color": colour, "size": 6, "opacity": 0.65}
+    meta = {"member": member_id(analysis.member)}
+    return {"x": json_numbers(x), "y": json_numbers(y), "mode": "markers", "marker": marker, "name": name, "meta": meta}
+
+
+def _path(path: np.ndarray, colour: str, name: str, analysis: MemberAnalysis) -> Trace:
+    """Return a line with a dot at its end."""
+    x, y = path.T
+    sizes = [0] * (len(path) - 1) + [6]
+    drawn = {"mode": "lines+markers", "line": {"color": colour, "width": 2}, "showlegend": False}
+    return _dots(x, y, colour, name, analysis) | drawn | {"marker": {"color": colour, "size": sizes, "opacity": 1}}
+
+
+def _goal(analysis: MemberAnalysis) -> list[Trace]:
+    """Return a star at the goal; nothing for a task whose goal is no place."""
+    if "goal" not in analysis.data:
+        return []
+    x, y = analysis.data["goal"]
+    marker = {"symbol": "star", "size": 15, "color": "#d00000"}
+    own = {"mode": "markers", "marker": marker, "name": "goal", "showlegend": False}
+    return [{"x": [float(x)], "y": [float(y)], **own}]
+
+
+def _map_layout(analysis: MemberAnalysis) -> dict[str, Any]:
+    """Return the layout of a map: one unit is as long in x as in y, walls are grey boxes."""
+    layout = axis_layout("", "") | {"margin": {"l": 30, "r": 10, "t": 10, "b": 26}}
+    layout["xaxis"] |= {"constrain": "domain", "showgrid": False, "zeroline": False}
+    layout["yaxis"] |= {"constrain": "domain", "showgrid": False, "zeroline": False, "scaleanchor": "x"}
+    if (extent := maze_extent(analysis)) is not None:
+        (left, low), (right, high), half = extent
+        layout["shapes"] = [_wall(x, y, half) for x, y in analysis.data["walls"]]
+        layout["xaxis"]["range"] = [float(left), float(right)]
+        layout["yaxis"]["range"] = [float(low), float(high)]
+    return layout
+
+
+def _wall(x: float, y: float, half: float) -> dict[str, Any]:
+    box = {"x0": float(x) - half, "x1": float(x) + half, "y0": float(y) - half, "y1": float(y) + half}
+    return {"type": "rect", **box, "fillcolor": WALL_COLOUR, "line": {"width": 0}, "layer": "below"}
+
+
+def _by_direction(x: float, y: float) -> str:
+    away = min(1.0, float(np.hypot(x, y)))
+    colour = colorsys.hsv_to_rgb(float(np.arctan2(y, x)) / (2 * np.pi) % 1, 0.85 * away, 0.6 + 0.2 * away)
+    return _hex(np.array(colour) * 255)
+
+
+def _hex(colour: np.ndarray) -> str:
+    return "#" + "".join(f"{round(float(part)):02x}" for part in colour)
+
+
+def _jpeg(frame: np.ndarray) -> str:
+    """Return a picture as a data URI."""
+    content = io.BytesIO()
+    matplotlib.image.imsave(content, frame, format="jpeg")
+    return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
