@@ -17,7 +17,6 @@ from qdos_brax.methods import build
 from qdos_brax.runs.checkpoint import CheckpointStore, Position
 from qdos_brax.runs.folder import RunFolder
 
-
 # As every run has it (``qdos_brax.runs.jax_setup``): programs that call MuJoCo C can wait for ever on arrays that wait
 # for them if they are dispatched asynchronously.
 jax.config.update("jax_cpu_enable_async_dispatch", False)
