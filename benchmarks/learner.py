@@ -147,14 +147,14 @@ def reference_sac(width: int) -> Calls:
     }
     parameters["target"] = jax.tree.map(jnp.copy, parameters["critic"])
     parameters["log_temperature"] = jnp.zeros(())
-    moments = {name: optimiser.init(parameters[name]) for name in ("critic", "actor", "log_temperature")}
+    opt_state = {name: optimiser.init(parameters[name]) for name in ("critic", "actor", "log_temperature")}
 
-    def stepped(parameters: Any, moments: Any, name: str, gradient: Any) -> tuple[Any, Any]:
-        updates, new = optimiser.update(gradient, moments[name])
-        return parameters | {name: optax.apply_updates(parameters[name], updates)}, moments | {name: new}
+    def stepped(parameters: Any, opt_state: Any, name: str, gradient: Any) -> tuple[Any, Any]:
+        updates, new = optimiser.update(gradient, opt_state[name])
+        return parameters | {name: optax.apply_updates(parameters[name], updates)}, opt_state | {name: new}
 
     def critic_step(carry: Any, given: tuple[Batch, jax.Array]) -> tuple[Any, jax.Array]:
-        (parameters, moments), (batch, key) = carry, given
+        (parameters, opt_state), (batch, key) = carry, given
         action_key, subset_key = jax.random.split(key)
         action, _ = tanh_gaussian_sample(action_key, *actor.apply(parameters["actor"], batch.next_observation))
         index = jax.random.choice(subset_key, CRITICS, (1,), replace=False)
@@ -165,15 +165,15 @@ def reference_sac(width: int) -> Calls:
             return jnp.mean((critic.apply(critic_parameters, batch.observation, batch.action) - target) ** 2)
 
         found, gradient = jax.value_and_grad(loss)(parameters["critic"])
-        parameters, moments = stepped(parameters, moments, "critic", gradient)
+        parameters, opt_state = stepped(parameters, opt_state, "critic", gradient)
         target = optax.incremental_update(parameters["critic"], parameters["target"], TARGET_RATE)
-        return (parameters | {"target": target}, moments), found
+        return (parameters | {"target": target}, opt_state), found
 
     @jax.jit
-    def update(parameters: Any, moments: Any, batches: Batch, key: jax.Array) -> tuple[Any, Any]:
+    def update(parameters: Any, opt_state: Any, batches: Batch, key: jax.Array) -> tuple[Any, Any]:
         critic_key, actor_key = jax.random.split(key)
         keys = jax.random.split(critic_key, UTD)
-        (parameters, moments), _ = jax.lax.scan(critic_step, (parameters, moments), (batches, keys))
+        (parameters, opt_state), _ = jax.lax.scan(critic_step, (parameters, opt_state), (batches, keys))
         seen, temperature = batches.observation[-1], jnp.exp(parameters["log_temperature"])
 
         def actor_loss(actor_parameters: Any) -> tuple[jax.Array, jax.Array]:
@@ -182,11 +182,11 @@ def reference_sac(width: int) -> Calls:
             return jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
 
         (_, entropy), gradient = jax.value_and_grad(actor_loss, has_aux=True)(parameters["actor"])
-        parameters, moments = stepped(parameters, moments, "actor", gradient)
+        parameters, opt_state = stepped(parameters, opt_state, "actor", gradient)
         gradient = jax.grad(lambda log: jnp.exp(log) * (entropy + LATENT / 2))(parameters["log_temperature"])
-        return stepped(parameters, moments, "log_temperature", gradient)
+        return stepped(parameters, opt_state, "log_temperature", gradient)
 
-    rows, random, held = transitions(), np.random.default_rng(1), [parameters, moments, 0]
+    rows, random, held = transitions(), np.random.default_rng(1), [parameters, opt_state, 0]
 
     def calls() -> int:
         index = random.integers(0, ROWS, (UTD, BATCH))
@@ -256,7 +256,7 @@ def reference_vae() -> Calls:
     }
 
     @jax.jit
-    def update(parameters: Any, moments: Any, key: jax.Array) -> tuple[Any, Any]:
+    def update(parameters: Any, opt_state: Any, key: jax.Array) -> tuple[Any, Any]:
         def loss(parameters: Any) -> jax.Array:
             posterior = encoder.apply(parameters["encoder"], *segments)
             latent = gaussian_sample(key, *posterior)
@@ -266,8 +266,8 @@ def reference_vae() -> Calls:
             kl = gaussian_kl(*posterior, *prior.apply(parameters["prior"], segments.observations[:, 0]))
             return jnp.mean(0.1 * kl - log_likelihood)
 
-        updates, moments = optimiser.update(jax.grad(loss)(parameters), moments)
-        return optax.apply_updates(parameters, updates), moments
+        updates, opt_state = optimiser.update(jax.grad(loss)(parameters), opt_state)
+        return optax.apply_updates(parameters, updates), opt_state
 
     return repeated_update(update, parameters, optimiser.init(parameters))
 
@@ -278,9 +278,9 @@ def our_vae() -> Calls:
     parameters = model.init(jax.random.key(0))
 
     @jax.jit
-    def update(parameters: Any, moments: Any, key: jax.Array) -> tuple[Any, Any]:
+    def update(parameters: Any, opt_state: Any, key: jax.Array) -> tuple[Any, Any]:
         gradient = jax.grad(lambda p: model.vae_loss(p, segments, jnp.ones(BATCH), 0.1, key, True)[0])(parameters)
-        return adam_step(parameters, moments, gradient, RATE)
+        return adam_step(parameters, opt_state, gradient, RATE)
 
     return repeated_update(update, parameters, ADAM.init(parameters))
 
@@ -292,9 +292,9 @@ def windows() -> Segments:
     return Segments(*(jnp.asarray(random.standard_normal(shape), jnp.float32) for shape in shapes))
 
 
-def repeated_update(update: Callable[..., tuple[Any, Any]], parameters: Any, moments: Any) -> Calls:
+def repeated_update(update: Callable[..., tuple[Any, Any]], parameters: Any, opt_state: Any) -> Calls:
     """One gradient step a call."""
-    held = [parameters, moments, 0]
+    held = [parameters, opt_state, 0]
 
     def calls() -> int:
         held[2] += 1

@@ -23,7 +23,7 @@ from qdos_brax.config.methods import METHODS
 from qdos_brax.data import download, formats
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
-from qdos_brax.methods.build import build_phases, plan_members
+from qdos_brax.methods.build import bind_phases, build_context, build_phases, plan_members
 from qdos_brax.population.members import Population
 from qdos_brax.report.write import Report, write_report
 from qdos_brax.runs import comparison, observers, parts, signals
@@ -183,15 +183,17 @@ def _train(config: Config, folder: RunFolder, members: list[dict[str, Any]], sta
     dataset = formats.read(data_path, env)
     _same_data(folder, data_path)
     data_seconds = time.perf_counter() - before_data
-    found = plan_members(config, env, dataset, members)
+    context = build_context(config, env, dataset)
+    phases = build_phases(context)
+    found = plan_members(context, phases, members)
     print(f"members   {found.line}", flush=True)
     if config.members_per_program != found.per_program:
         config = configs.replace(config, members_per_program=found.per_program)
         write_text(folder.config, configs.to_yaml(config))
     hyper = configs.population_hyper(config, members)
-    population = Population(hyper, found.per_program, found.devices, found.parked)
+    bind_phases(phases, Population(hyper, found.per_program, found.devices, found.parked), context.data)
     return run_phases(
-        build_phases(config, env, dataset, population),
+        phases,
         folder,
         members,
         config=configs.config_hash(config),

@@ -31,10 +31,10 @@ SEEDS = "0,1,2,7"  # as many members as the toy has
 class DyingPhase(toy.ToyPhase):
     """Ends the program in its third chunk of the online phase, as a kill would: nothing is saved."""
 
-    def chunk(self, state: toy.ToyState) -> tuple[toy.ToyState, dict[str, Any]]:
+    def chunk(self, state: toy.ToyState, constants: None) -> tuple[toy.ToyState, dict[str, Any]]:
         if self.name == "online" and self.chunks_run == 2:
             raise MemoryError("killed")
-        return super().chunk(state)
+        return super().chunk(state, constants)
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(experiment.formats, "read", lambda path, env: None)
     monkeypatch.setattr(experiment, "build_phases", phases)
     monkeypatch.setattr(
-        experiment, "plan_members", lambda *args: memory.Plan((jax.local_devices()[0],), 1, False, "toys")
+        experiment, "plan_members", lambda *args: memory.MemoryPlan((jax.local_devices()[0],), 1, False, "toys")
     )
     monkeypatch.setattr(inside, "look_inside", lambda path: None)  # toys have nothing inside
     monkeypatch.setattr(experiment.jax, "clear_caches", lambda: None)  # the other tests' programs are theirs

@@ -16,11 +16,11 @@ from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
 from qdos_brax.data.device import Normaliser
 from qdos_brax.errors import UserError
-from qdos_brax.high_level.agent import Agent, Player
+from qdos_brax.high_level.agent import Agent, Policy
 from qdos_brax.high_level.evaluation import evaluate
-from qdos_brax.high_level.online_phase import high_level_sac
-from qdos_brax.methods.build import make_policy, make_source
-from qdos_brax.offline.player import FlatPlayer
+from qdos_brax.high_level.sac import SAC
+from qdos_brax.methods.build import make_low_level, make_policy
+from qdos_brax.offline.flat_policy import FlatPolicy
 from qdos_brax.population.members import Population
 from qdos_brax.runs.checkpoint import final_artifacts
 from qdos_brax.runs.folder import RunFolder
@@ -41,7 +41,7 @@ class TrainedRun(NamedTuple):
     env: Any
     artifacts: Any
     hyper: dict[str, jax.Array]
-    agent: Callable[[Any, Any], Player]
+    agent: Callable[[Any, Any], Policy]
 
 
 def load_run(run: Path) -> TrainedRun:
@@ -63,20 +63,20 @@ def load_run(run: Path) -> TrainedRun:
         env,
         final_artifacts(folder.checkpoints, configs.config_hash(config)),
         {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()},
-        _player(config, env),
+        _policy(config, env),
     )
 
 
-def _player(config: Config, env: Any) -> Callable[[Any, Any], Player]:
+def _policy(config: Config, env: Any) -> Callable[[Any, Any], Policy]:
     """(artifacts, hyper) of one member -> what plays."""
-    source, policy = make_source(config, env), METHODS[config.method].policy
+    low_level, policy = make_low_level(config, env), METHODS[config.method].policy
     if policy is not None:
         act = make_policy(config, env, policy).act
-        return lambda artifacts, hyper: FlatPlayer(Normaliser(**artifacts["normaliser"]), act, artifacts["policy"])
-    sac = high_level_sac(config, env.observation_size, source)
+        return lambda artifacts, hyper: FlatPolicy(Normaliser(**artifacts["normaliser"]), act, artifacts["policy"])
+    sac = SAC(env.observation_size, low_level.width, config.high_level)
     return lambda artifacts, hyper: Agent(
         normaliser=Normaliser(**artifacts["normaliser"]),
-        source=source,
+        low_level=low_level,
         sac=sac,
         box=hyper["skills.latent_box"],
         skills=artifacts.get("skills", {}),

@@ -24,7 +24,7 @@ from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
 from qdos_brax.errors import UserError
 from qdos_brax.files import replacing
-from qdos_brax.methods.build import make_source
+from qdos_brax.methods.build import make_low_level
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.skills.vae import Segments
 from qdos_brax.skills.weights import advantage_weights
@@ -164,7 +164,7 @@ class _LatentView:
         self._segments = Segments(*window((data.observations, data.actions), starts, horizon))
         self._after = data.next_observations[starts + horizon - 1]
         self._steps = min(_HELD * horizon, trained.env.episode_length)
-        self._posterior = jax.jit(make_source(trained.config, trained.env).posterior)
+        self._posterior = jax.jit(make_low_level(trained.config, trained.env).posterior)
         self._play = jax.jit(jax.vmap(self._path, in_axes=(None, None, 0)))
 
     def of(self, member: int) -> Arrays:

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.data.segments import episode_last, macro_return, segment_starts, window
+from qdos_brax.data.segments import episode_last, segment_starts
 
 
 class Normaliser(struct.PyTreeNode):
@@ -58,15 +58,6 @@ class DeviceData(struct.PyTreeNode):
     qvel: jax.Array | None
 
 
-class MacroRows(struct.PyTreeNode):
-    """Windows seen as macro transitions, leading axis B: reward is the discounted sum over the live steps."""
-
-    observation: jax.Array
-    reward: jax.Array
-    mask: jax.Array
-    next_observation: jax.Array
-
-
 def to_device(dataset: Dataset, horizon: int) -> tuple[DeviceData, Normaliser]:
     """Puts ``dataset`` on the default device, normalised by its own statistics."""
     mean = dataset.observations.mean(axis=0, dtype=np.float64).astype(np.float32)
@@ -84,9 +75,3 @@ def to_device(dataset: Dataset, horizon: int) -> tuple[DeviceData, Normaliser]:
         qvel=None if dataset.qvel is None else jnp.asarray(dataset.qvel),
     )
     return data, normaliser
-
-
-def macro_rows(data: DeviceData, starts: jax.Array, horizon: int, discount: jax.Array | float) -> MacroRows:
-    """The windows at ``starts[B]`` as macro transitions of ``horizon`` steps."""
-    reward, mask = macro_return(*window((data.rewards, data.masks), starts, horizon), discount)
-    return MacroRows(data.observations[starts], reward, mask, data.next_observations[starts + horizon - 1])

@@ -9,10 +9,10 @@ import jax
 
 from qdos_brax.data.device import Normaliser
 from qdos_brax.high_level.sac import SAC
-from qdos_brax.skills.source import SkillSource
+from qdos_brax.skills.low_level import LowLevelPolicy
 
 
-class Player(Protocol):
+class Policy(Protocol):
     """Whatever plays episodes: a decision every H environment steps, and actions in between."""
 
     def choose(self, observation: jax.Array) -> jax.Array:
@@ -30,15 +30,15 @@ class Agent:
 
     Attributes:
         normaliser: of observations.
-        source: what the high level's action does.
+        low_level: what the high level's action does.
         sac: the high level.
         box: half the side of the box of latents.
-        skills: parameters of the source.
+        skills: parameters of the low-level policy.
         actor: parameters of the high level's actor.
     """
 
     normaliser: Normaliser
-    source: SkillSource
+    low_level: LowLevelPolicy
     sac: SAC
     box: jax.Array | float
     skills: Any
@@ -47,8 +47,8 @@ class Agent:
     def choose(self, observation: jax.Array) -> jax.Array:
         """The latent z[..., width] for observation[..., obs]: the mode of the high level's policy."""
         normal = self.normaliser(observation)
-        return self.source.to_latent(self.skills, self.sac.mode(self.actor, normal), normal, self.box)
+        return self.low_level.to_latent(self.skills, self.sac.mode(self.actor, normal), normal, self.box)
 
     def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
         """The action[..., act] of latent z at an observation."""
-        return self.source.act(self.skills, self.normaliser(observation), latent)
+        return self.low_level.act(self.skills, self.normaliser(observation), latent)

@@ -6,30 +6,22 @@ may be scanned is an argument, so that members of a population differ along a ``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
 
+from qdos_brax.config import HighLevelConfig
+from qdos_brax.data.transitions import Transition
 from qdos_brax.nn.networks import DiagonalGaussian, Ensemble, tanh_gaussian_sample
 from qdos_brax.nn.optim import ADAM, adam_step, polyak
 
 Params = Any
 # (observation[B], action[B]) -> log density[B] that the actor is held against; without one, it is uniform (SAC).
 Reference = Callable[[jax.Array, jax.Array], jax.Array]
-
-
-class Batch(NamedTuple):
-    """Transitions, leading axis B. ``mask`` is 0 where the value of ``next_observation`` must not be used."""
-
-    observation: jax.Array
-    action: jax.Array
-    reward: jax.Array
-    mask: jax.Array
-    next_observation: jax.Array
 
 
 class SACHyper(struct.PyTreeNode):
@@ -45,15 +37,15 @@ class SACHyper(struct.PyTreeNode):
 
 
 class SACState(struct.PyTreeNode):
-    """Everything that learns: parameters, the target ensemble, the temperature, and Adam's moments for each."""
+    """Everything that learns: parameters, the target ensemble, the temperature, and Adam's states."""
 
     actor: Params
     critic: Params
     target_critic: Params
     log_temperature: jax.Array
-    actor_moments: optax.OptState
-    critic_moments: optax.OptState
-    temperature_moments: optax.OptState
+    actor_opt_state: optax.OptState
+    critic_opt_state: optax.OptState
+    temperature_opt_state: optax.OptState
 
 
 class SAC:
@@ -62,30 +54,25 @@ class SAC:
     Args:
         observation_dim: width of observations.
         action_dim: width of actions, which lie in (-1, 1).
-        hidden: hidden widths of actor and critics.
-        ensemble: number of critics, with LayerNorm.
-        target_subset: random critics of the target ensemble whose minimum is the bootstrap value.
-        entropy_backup: subtract the entropy term from the bootstrap value (SAC does, RLPD's mazes do not).
-        value_scale: the Q that an output of 1 of a critic's network stands for. Adam moves weights at a speed of its
-            own, so that networks whose outputs must reach hundreds take long to get there.
+        config: widths, critics (with LayerNorm), and ``value_scale``: Adam moves weights at a speed of its own, so
+            that networks whose outputs must reach hundreds take long to get there.
+        entropy_backup: whether the entropy term is subtracted from the bootstrap value: SAC does, RLPD's mazes do not,
+            SPiRL (Pertsch et al. 2020) does with its divergence. None does where ``config.regulariser`` is "prior".
     """
 
     def __init__(
         self,
         observation_dim: int,
         action_dim: int,
-        hidden: Sequence[int],
-        ensemble: int,
-        target_subset: int,
-        entropy_backup: bool = False,
-        value_scale: float = 1.0,
+        config: HighLevelConfig,
+        entropy_backup: bool | None = None,
     ) -> None:
         self.observation_dim, self.action_dim = observation_dim, action_dim
-        self.ensemble, self.target_subset, self.entropy_backup = ensemble, target_subset, entropy_backup
-        self.value_scale = value_scale
-        self.actor = DiagonalGaussian(tuple(hidden), action_dim)
-        self.critic = Ensemble(tuple(hidden), ensemble)
-        self._target_heads = Ensemble(tuple(hidden), target_subset)
+        self.ensemble, self.target_subset, self.value_scale = config.ensemble, config.target_subset, config.value_scale
+        self.entropy_backup = config.regulariser == "prior" if entropy_backup is None else entropy_backup
+        self.actor = DiagonalGaussian(config.hidden, action_dim)
+        self.critic = Ensemble(config.hidden, config.ensemble)
+        self._target_heads = Ensemble(config.hidden, config.target_subset)
 
     def init(self, key: jax.Array, init_temperature: jax.Array | float) -> SACState:
         """Fresh parameters; the target ensemble starts as a copy."""
@@ -99,9 +86,9 @@ class SAC:
             critic=critic,
             target_critic=jax.tree.map(jnp.copy, critic),
             log_temperature=log_temperature,
-            actor_moments=ADAM.init(actor),
-            critic_moments=ADAM.init(critic),
-            temperature_moments=ADAM.init(log_temperature),
+            actor_opt_state=ADAM.init(actor),
+            critic_opt_state=ADAM.init(critic),
+            temperature_opt_state=ADAM.init(log_temperature),
         )
 
     def act(self, actor: Params, key: jax.Array, observation: jax.Array) -> jax.Array:
@@ -133,7 +120,7 @@ class SAC:
             value = value - jnp.exp(state.log_temperature) * log_prob
         return value
 
-    def critic_loss(self, critic: Params, batch: Batch, target: jax.Array) -> jax.Array:
+    def critic_loss(self, critic: Params, batch: Transition, target: jax.Array) -> jax.Array:
         """Mean over batch and sum over critics of the squared error to target[B]."""
         error = self.values(critic, batch.observation, batch.action) - target
         return jnp.mean(jnp.sum(error**2, axis=0))
@@ -160,16 +147,16 @@ class SAC:
         return jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
 
     def update_critic(
-        self, state: SACState, batch: Batch, key: jax.Array, hyper: SACHyper, reference: Reference | None = None
+        self, state: SACState, batch: Transition, key: jax.Array, hyper: SACHyper, reference: Reference | None = None
     ) -> tuple[SACState, dict[str, jax.Array]]:
         """One step of every critic and of the target ensemble."""
         bootstrap = self.target_value(state, key, batch.next_observation, reference)
         target = jax.lax.stop_gradient(batch.reward + hyper.discount * batch.mask * bootstrap)
         loss, grads = jax.value_and_grad(self.critic_loss)(state.critic, batch, target)
-        critic, moments = adam_step(state.critic, state.critic_moments, grads, hyper.learning_rate)
+        critic, opt_state = adam_step(state.critic, state.critic_opt_state, grads, hyper.learning_rate)
         target_critic = polyak(state.target_critic, critic, hyper.target_rate)
         info = {"critic_loss": loss / self.ensemble, "q": jnp.mean(target)}
-        return state.replace(critic=critic, critic_moments=moments, target_critic=target_critic), info
+        return state.replace(critic=critic, critic_opt_state=opt_state, target_critic=target_critic), info
 
     def update_actor(
         self,
@@ -184,16 +171,16 @@ class SAC:
         (loss, entropy), grads = jax.value_and_grad(self.actor_loss, has_aux=True)(
             state.actor, state.critic, temperature, observation, key, reference
         )
-        actor, actor_moments = adam_step(state.actor, state.actor_moments, grads, hyper.learning_rate)
+        actor, actor_opt_state = adam_step(state.actor, state.actor_opt_state, grads, hyper.learning_rate)
         temperature_grad = temperature * (entropy - hyper.target_entropy)
-        log_temperature, temperature_moments = adam_step(
-            state.log_temperature, state.temperature_moments, temperature_grad, hyper.learning_rate
+        log_temperature, temperature_opt_state = adam_step(
+            state.log_temperature, state.temperature_opt_state, temperature_grad, hyper.learning_rate
         )
         info = {"actor_loss": loss, "entropy": entropy, "temperature": temperature}
         state = state.replace(
             actor=actor,
-            actor_moments=actor_moments,
+            actor_opt_state=actor_opt_state,
             log_temperature=log_temperature,
-            temperature_moments=temperature_moments,
+            temperature_opt_state=temperature_opt_state,
         )
         return state, info

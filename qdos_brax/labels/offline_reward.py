@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from qdos_brax.data.device import MacroRows
+from qdos_brax.data.transitions import Transition
 from qdos_brax.labels.reward_model import RewardModel, RewardModelState
 
 
@@ -18,11 +18,11 @@ class OfflineReward(Protocol):
         """What it carries."""
         ...
 
-    def learn(self, state: Any, rows: MacroRows, action: jax.Array, learning_rate: Any, active: jax.Array) -> Any:
+    def learn(self, state: Any, rows: Transition, learning_rate: Any, active: jax.Array) -> Any:
         """One gradient step on online rows[B], if ``active``."""
         ...
 
-    def label(self, state: Any, rows: MacroRows, action: jax.Array, discount: Any) -> tuple[jax.Array, jax.Array]:
+    def label(self, state: Any, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
         """(reward[B], mask[B]) of offline rows[B]; ``discount`` is the one within a macro step."""
         ...
 
@@ -34,11 +34,11 @@ class DataReward:
         """Carries nothing."""
         return {}
 
-    def learn(self, state: Any, rows: MacroRows, action: jax.Array, learning_rate: Any, active: jax.Array) -> Any:
+    def learn(self, state: Any, rows: Transition, learning_rate: Any, active: jax.Array) -> Any:
         """Learns nothing."""
         return state
 
-    def label(self, state: Any, rows: MacroRows, action: jax.Array, discount: Any) -> tuple[jax.Array, jax.Array]:
+    def label(self, state: Any, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
         """As they are."""
         return rows.reward, rows.mask
 
@@ -58,17 +58,15 @@ class PredictedReward:
         return self._model.init(key)
 
     def learn(
-        self, state: RewardModelState, rows: MacroRows, action: jax.Array, learning_rate: Any, active: jax.Array
+        self, state: RewardModelState, rows: Transition, learning_rate: Any, active: jax.Array
     ) -> RewardModelState:
         """One step of both heads."""
-        new = self._model.update(state, rows.observation, action, rows.reward, rows.mask, learning_rate)
+        new = self._model.update(state, rows.observation, rows.action, rows.reward, rows.mask, learning_rate)
         return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, state)
 
-    def label(
-        self, state: RewardModelState, rows: MacroRows, action: jax.Array, discount: Any
-    ) -> tuple[jax.Array, jax.Array]:
+    def label(self, state: RewardModelState, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
         """Prediction, and the probability of going on."""
-        reward, logit = self._model.predict(state.params, rows.observation, action)
+        reward, logit = self._model.predict(state.params, rows.observation, rows.action)
         return reward, jax.nn.sigmoid(logit)
 
 
@@ -77,16 +75,15 @@ class MinimumReward(PredictedReward):
 
     Args:
         model: the reward model.
-        horizon: environment steps of a macro step; each earns -1 at worst on these tasks.
+        horizon: environment steps of a macro step.
+        lowest: the lowest reward of an environment step.
     """
 
-    def __init__(self, model: RewardModel, horizon: int) -> None:
+    def __init__(self, model: RewardModel, horizon: int, lowest: float) -> None:
         super().__init__(model)
-        self._horizon = horizon
+        self._horizon, self._lowest = horizon, lowest
 
-    def label(
-        self, state: RewardModelState, rows: MacroRows, action: jax.Array, discount: Any
-    ) -> tuple[jax.Array, jax.Array]:
+    def label(self, state: RewardModelState, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
         """The constant, and the probability of going on."""
-        _, mask = super().label(state, rows, action, discount)
-        return jnp.full_like(rows.reward, -jnp.sum(discount ** jnp.arange(self._horizon))), mask
+        _, mask = super().label(state, rows, discount)
+        return jnp.full_like(rows.reward, self._lowest * jnp.sum(discount ** jnp.arange(self._horizon))), mask

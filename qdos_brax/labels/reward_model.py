@@ -15,10 +15,10 @@ from qdos_brax.nn.optim import ADAM, adam_step
 
 
 class RewardModelState(struct.PyTreeNode):
-    """Parameters of both heads and Adam's moments."""
+    """Parameters of both heads and Adam's state."""
 
     params: Any
-    moments: optax.OptState
+    opt_state: optax.OptState
 
 
 class RewardModel:
@@ -64,5 +64,5 @@ class RewardModel:
     ) -> RewardModelState:
         """One gradient step on online rows[B]."""
         grads = jax.grad(self.loss)(state.params, observation, action, reward, mask)
-        params, moments = adam_step(state.params, state.moments, grads, learning_rate)
-        return RewardModelState(params, moments)
+        params, opt_state = adam_step(state.params, state.opt_state, grads, learning_rate)
+        return RewardModelState(params, opt_state)

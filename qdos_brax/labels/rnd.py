@@ -15,11 +15,11 @@ from qdos_brax.nn.optim import ADAM, adam_step
 
 
 class RNDState(struct.PyTreeNode):
-    """The fixed random network, the predictor that learns to imitate it, and Adam's moments."""
+    """The fixed random network, the predictor that learns to imitate it, and Adam's state."""
 
     target: Any
     predictor: Any
-    moments: optax.OptState
+    opt_state: optax.OptState
 
 
 class RND:
@@ -51,5 +51,5 @@ class RND:
     def update(self, state: RNDState, observation: jax.Array, action: jax.Array, learning_rate: Any) -> RNDState:
         """One step of the predictor on rows[B]."""
         grads = jax.grad(lambda p: jnp.mean(self.error(p, state.target, observation, action)))(state.predictor)
-        predictor, moments = adam_step(state.predictor, state.moments, grads, learning_rate)
-        return state.replace(predictor=predictor, moments=moments)
+        predictor, opt_state = adam_step(state.predictor, state.opt_state, grads, learning_rate)
+        return state.replace(predictor=predictor, opt_state=opt_state)

@@ -1,4 +1,7 @@
-"""From a recipe and a configuration to the phases of a run."""
+"""From a method and a configuration to the phases of a run.
+
+A new kind of low-level policy, guide or flat policy is a learner, a section of the configuration and an entry here.
+"""
 
 from __future__ import annotations
 
@@ -24,195 +27,202 @@ from qdos_brax.labels.rnd import RND
 from qdos_brax.offline.bc import BC
 from qdos_brax.offline.diffusion import DiffusionBC
 from qdos_brax.offline.diveoff import DiveOff
+from qdos_brax.offline.flat_policy import FlatPolicy
 from qdos_brax.offline.hilbert import Hilbert
 from qdos_brax.offline.iql_policy import IQLPolicy
 from qdos_brax.offline.learner import Learner, PolicyLearner
 from qdos_brax.offline.offline_phase import Evaluation, OfflinePhase
-from qdos_brax.offline.player import FlatPlayer
 from qdos_brax.population import memory
 from qdos_brax.population.members import Population
-from qdos_brax.runs.loop import Phase
+from qdos_brax.population.phase import MemberPhase
 from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
+from qdos_brax.skills.low_level import (
+    DirectionSkills,
+    LowLevelPolicy,
+    PrimitiveActions,
+    TrajectorySkills,
+    TransitionSkills,
+)
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, SegmentWeights, UniformWeights
 from qdos_brax.skills.skill_phase import Information, SkillPhase
-from qdos_brax.skills.source import ActionSource, DirectionSource, SkillSource, TrajectorySource, TransitionSource
 from qdos_brax.skills.vae import SkillModel
 from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
 
 
-class RunPhase(Phase, memory.Sized, Protocol):
-    """A phase that the loop can run, and whose memory is known before."""
+class Sizes(Protocol):
+    """Give the sizes of a task's observations and actions; every environment does."""
+
+    observation_size: int
+    action_size: int
 
 
-def build_phases(config: Config, env: Any, dataset: Dataset, population: Population) -> list[RunPhase]:
-    """The phases of ``config.method``, in order.
+class BuildContext(NamedTuple):
+    """Hold what every phase of a run is made from.
 
-    Args:
+    Attributes:
         config: the run's configuration.
-        env: the task's environment, as ``envs.make`` gives it.
+        method: its method.
+        env: the task.
         dataset: the data, labelled for that task.
-        population: the run's members.
-
-    Raises:
-        UserError: the data cannot serve this configuration.
+        data: the same on the default device, normalised.
+        normaliser: of observations.
     """
-    task = _task(config, env, dataset, population)
-    high = config.high_level
-    source = make_source(config, env)
-    if task.recipe.policy is not None:
-        return [_policy_phase(task, task.recipe.policy)]
-    labelled = round(high.batch_size * high.offline_fraction) > 0
-    guide = None if task.recipe.guide is None else _GUIDES[task.recipe.guide](config, env)
-    return [
-        *_SOURCES[task.recipe.source].phases(task),
-        *([] if guide is None else [_offline_phase(task, "guide", guide.learner, config.guide.updates)]),
-        *([LabelPhase(config, task.data, population, source)] if labelled else []),
-        OnlinePhase(
-            config,
-            env,
-            task.data,
-            task.normaliser,
-            population,
-            source,
-            _labeller(config, env, source),
-            _bonus(config, env, source),
-            None if guide is None else guide.jump_start,
-        ),
-    ]
-
-
-def plan_members(config: Config, env: Any, dataset: Dataset, members: Sequence[Mapping[str, Any]]) -> memory.Plan:
-    """How the members run on this process's devices, by an estimate of their memory where there is a choice.
-
-    Raises:
-        UserError: the data cannot serve this configuration.
-    """
-    if len(members) == 1:
-        return memory.Plan((jax.local_devices()[0],), 1, False, "1 member")
-    one = Population(configs.population_hyper(config, members[:1]))
-    shared = sum(value.nbytes for value in vars(dataset).values() if isinstance(value, np.ndarray))
-    need = memory.estimate(build_phases(config, env, dataset, one), shared)
-    devices = jax.local_devices()
-    return memory.plan(need, len(members), devices, memory.room_of(devices[0]), config.members_per_program)
-
-
-def make_source(config: Config, env: Any) -> SkillSource:
-    """The method's source of low-level behaviour."""
-    return _SOURCES[METHODS[config.method].source].make(config, env)
-
-
-class _Task(NamedTuple):
-    """What every phase of a run is made from."""
 
     config: Config
-    recipe: Recipe
+    method: Recipe
     env: Any
     dataset: Dataset
     data: DeviceData
     normaliser: Normaliser
-    population: Population
 
 
-def _task(config: Config, env: Any, dataset: Dataset, population: Population) -> _Task:
+def build_context(config: Config, env: Any, dataset: Dataset) -> BuildContext:
+    """Move the data to the device, once for all phases and members.
+
+    Raises:
+        UserError: no episode is as long as a segment.
+    """
     data, normaliser = to_device(dataset, config.skills.horizon)
     if data.starts.shape[0] == 0:
         raise UserError(
             f"no episode of {dataset.source} has {config.skills.horizon} steps, the length of a skill "
             "(--set skills.horizon=N shortens it)"
         )
-    return _Task(config, METHODS[config.method], env, dataset, population.shared(data), normaliser, population)
+    return BuildContext(config, METHODS[config.method], env, dataset, data, normaliser)
 
 
-class _Source(NamedTuple):
-    """A kind of low-level behaviour: how it is made, and the phases that learn it."""
+def build_phases(context: BuildContext) -> list[MemberPhase]:
+    """Return the phases of ``context.method`` in order, to be bound to a population.
 
-    make: Callable[[Config, Any], SkillSource]
-    phases: Callable[[_Task], list[RunPhase]]
-
-
-def _trajectory_source(config: Config, env: Any) -> SkillSource:
-    return TrajectorySource(_skill_model(config, env), config.high_level.latent_map)
-
-
-def _trajectory_phases(task: _Task) -> list[RunPhase]:
-    config, recipe, env, data = task.config, task.recipe, task.env, task.data
-    if recipe.weighted and config.values.n_step > config.skills.horizon:
-        raise UserError(
-            f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({config.skills.horizon})"
-        )
-    model = _skill_model(config, env)
-    information = _information(config, recipe, env, model, task.normaliser, data)
+    Raises:
+        UserError: the data cannot serve this configuration.
+    """
+    config, method, env = context.config, context.method, context.env
+    low_level = make_low_level(config, env)
+    if method.policy is not None:
+        return [_policy_phase(context, method.policy)]
+    labelled = round(config.high_level.batch_size * config.high_level.offline_fraction) > 0
+    guide = None if method.guide is None else _GUIDES[method.guide](config, env)
     return [
-        *([value_phase(config, env, task.dataset, data, task.population)] if recipe.weighted else []),
-        SkillPhase(config, data, task.population, model, _weights(config, recipe, env), information),
+        *_LOW_LEVEL[method.source].phases(context),
+        *([] if guide is None else [_offline_phase(context, "guide", guide.learner, config.guide.updates)]),
+        *([LabelPhase(config.skills.horizon, len(context.data.starts), low_level)] if labelled else []),
+        OnlinePhase(
+            config,
+            env,
+            context.normaliser,
+            low_level,
+            _labeller(context, low_level),
+            _bonus(config, env, low_level),
+            None if guide is None else guide.jump_start,
+        ),
     ]
 
 
-def _hilbert(config: Config, env: Any) -> Hilbert:
-    own = config.hilbert
-    return Hilbert(
-        env.observation_size,
-        env.action_size,
-        config.skills.latent_dim,
-        own.hidden,
-        own.batch_size,
-        own.random_goals,
-    )
+def plan_members(
+    context: BuildContext, phases: Sequence[MemberPhase], members: Sequence[Mapping[str, Any]]
+) -> memory.MemoryPlan:
+    """Return how the members run on this process's devices, by an estimate of their memory where there is a choice."""
+    if len(members) == 1:
+        return memory.MemoryPlan((jax.local_devices()[0],), 1, False, "1 member")
+    config, dataset = context.config, context.dataset
+    bind_phases(phases, Population(configs.population_hyper(config, members[:1])), context.data)
+    shared = sum(value.nbytes for value in vars(dataset).values() if isinstance(value, np.ndarray))
+    need = memory.estimate(phases, shared)
+    devices = jax.local_devices()
+    return memory.plan(need, len(members), devices, memory.room_of(devices[0]), config.members_per_program)
 
 
-def _direction_source(config: Config, env: Any) -> SkillSource:
+def bind_phases(phases: Sequence[MemberPhase], population: Population, data: DeviceData) -> None:
+    """Compile the phases' programs for ``population``; the data is put on all of its devices, once."""
+    shared = population.shared(data)
+    for phase in phases:
+        phase.bind(population, shared)
+
+
+def make_low_level(config: Config, env: Sizes) -> LowLevelPolicy:
+    """Return the method's low-level policy; its parameters are what its phases learn."""
+    return _LOW_LEVEL[METHODS[config.method].source].make(config, env)
+
+
+class _LowLevelKind(NamedTuple):
+    """A kind of low-level policy: how it is made, and the phases that learn it."""
+
+    make: Callable[[Config, Sizes], LowLevelPolicy]
+    phases: Callable[[BuildContext], list[MemberPhase]]
+
+
+def make_skill_model(config: Config, env: Sizes) -> SkillModel:
+    """Return the trajectory VAE of a configuration."""
+    return SkillModel(env.observation_size, env.action_size, config.skills)
+
+
+def _trajectory_skills(config: Config, env: Sizes) -> LowLevelPolicy:
+    return TrajectorySkills(make_skill_model(config, env), config.high_level.latent_map)
+
+
+def _trajectory_phases(context: BuildContext) -> list[MemberPhase]:
+    config, method = context.config, context.method
+    if method.weighted and config.values.n_step > config.skills.horizon:
+        raise UserError(
+            f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({config.skills.horizon})"
+        )
+    model = make_skill_model(config, context.env)
+    skills = SkillPhase(config, model, _weights(config, method, context.env), _information(context, model))
+    return [value_phase(config, context.env, context.dataset.ends), skills] if method.weighted else [skills]
+
+
+def _hilbert(config: Config, env: Sizes) -> Hilbert:
+    return Hilbert(env.observation_size, env.action_size, config.skills.latent_dim, config.hilbert)
+
+
+def _direction_skills(config: Config, env: Sizes) -> LowLevelPolicy:
     learner = _hilbert(config, env)
-    return DirectionSource(learner.latent_dim, learner.direction, learner.act)
+    return DirectionSkills(learner.latent_dim, learner.direction, learner.act)
 
 
-def _direction_phases(task: _Task) -> list[RunPhase]:
-    return [_offline_phase(task, "skills", _hilbert(task.config, task.env), task.config.hilbert.updates)]
+def _direction_phases(context: BuildContext) -> list[MemberPhase]:
+    learner = _hilbert(context.config, context.env)
+    return [_offline_phase(context, "skills", learner, context.config.hilbert.updates)]
 
 
-def _diveoff(config: Config, env: Any) -> DiveOff:
-    own = config.diveoff
-    return DiveOff(
-        env.observation_size,
-        env.action_size,
-        config.skills.latent_dim,
-        own.hidden,
-        own.batch_size,
-        own.autoencoder_updates,
-    )
+def _diveoff(config: Config, env: Sizes) -> DiveOff:
+    return DiveOff(env.observation_size, env.action_size, config.skills.latent_dim, config.diveoff)
 
 
-def _transition_source(config: Config, env: Any) -> SkillSource:
+def _transition_skills(config: Config, env: Sizes) -> LowLevelPolicy:
     learner = _diveoff(config, env)
-    return TransitionSource(learner, learner.encode, config.high_level.latent_map)
+    return TransitionSkills(learner, learner.encode, config.high_level.latent_map)
 
 
-def _transition_phases(task: _Task) -> list[RunPhase]:
-    return [_offline_phase(task, "skills", _diveoff(task.config, task.env), task.config.diveoff.updates)]
+def _transition_phases(context: BuildContext) -> list[MemberPhase]:
+    learner = _diveoff(context.config, context.env)
+    return [_offline_phase(context, "skills", learner, context.config.diveoff.updates)]
 
 
-def _action_source(config: Config, env: Any) -> SkillSource:
+def _primitive_actions(config: Config, env: Sizes) -> LowLevelPolicy:
     if config.skills.horizon != 1:
         raise UserError(
             f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, "
             f"not {config.skills.horizon}"
         )
-    return ActionSource(env.action_size)
+    return PrimitiveActions(env.action_size)
 
 
-_SOURCES = {
-    "trajectory": _Source(_trajectory_source, _trajectory_phases),
-    "transition": _Source(_transition_source, _transition_phases),
-    "direction": _Source(_direction_source, _direction_phases),
-    "action": _Source(_action_source, lambda task: []),
+_LOW_LEVEL = {
+    "trajectory": _LowLevelKind(_trajectory_skills, _trajectory_phases),
+    "transition": _LowLevelKind(_transition_skills, _transition_phases),
+    "direction": _LowLevelKind(_direction_skills, _direction_phases),
+    "action": _LowLevelKind(_primitive_actions, lambda context: []),
 }
 
 
 def _offline_phase(
-    task: _Task, name: str, learner: Learner, updates: int, evaluation: Evaluation | None = None
+    context: BuildContext, name: str, learner: Learner, updates: int, evaluation: Evaluation | None = None
 ) -> OfflinePhase:
-    return OfflinePhase(name, learner, task.data, task.normaliser, task.population, updates, evaluation)
+    return OfflinePhase(name, learner, context.normaliser, updates, evaluation)
 
 
 class _Guide(NamedTuple):
@@ -222,69 +232,59 @@ class _Guide(NamedTuple):
     jump_start: JumpStart
 
 
-def _diffusion_guide(config: Config, env: Any) -> _Guide:
-    own = config.guide
-    learner = DiffusionBC(env.observation_size, env.action_size, own.hidden, own.steps, own.batch_size)
-    return _Guide(learner, JumpStart(learner.sample, own.ratio, own.persistence))
+def _diffusion_guide(config: Config, env: Sizes) -> _Guide:
+    learner = DiffusionBC(env.observation_size, env.action_size, config.guide)
+    return _Guide(learner, JumpStart(learner.sample, config.guide.ratio, config.guide.persistence))
 
 
 _GUIDES = {"diffusion": _diffusion_guide}
 
 
-def _bc(config: Config, env: Any) -> PolicyLearner:
-    return BC(env.observation_size, env.action_size, config.policy.hidden, config.policy.batch_size)
+def _bc(config: Config, env: Sizes) -> PolicyLearner:
+    return BC(env.observation_size, env.action_size, config.policy)
 
 
-def _iql(config: Config, env: Any) -> PolicyLearner:
+def _iql(config: Config, env: Sizes) -> PolicyLearner:
     values = IQL(env.observation_size, env.action_size, config.values.hidden)
-    return IQLPolicy(env.observation_size, env.action_size, config.policy.hidden, values, config.policy.batch_size)
+    return IQLPolicy(env.observation_size, env.action_size, config.policy, values)
 
 
 _POLICIES = {"bc": _bc, "iql": _iql}
 
 
-def make_policy(config: Config, env: Any, name: str) -> PolicyLearner:
-    """Return the learner of the flat policy called ``name``, a recipe's ``policy``."""
+def make_policy(config: Config, env: Sizes, name: str) -> PolicyLearner:
+    """Return the learner of the flat policy called ``name``, a method's ``policy``."""
     return _POLICIES[name](config, env)
 
 
-def _policy_phase(task: _Task, name: str) -> OfflinePhase:
-    """The one phase of a policy that is learned from the data alone, with its learning curve."""
-    config, learner = task.config, make_policy(task.config, task.env, name)
+def _policy_phase(context: BuildContext, name: str) -> OfflinePhase:
+    """Return the one phase of a policy that is learned from the data alone, with its learning curve."""
+    config, learner = context.config, make_policy(context.config, context.env, name)
     evaluation = Evaluation(
-        task.env,
-        lambda params: FlatPlayer(task.normaliser, learner.act, params),
+        context.env,
+        lambda params: FlatPolicy(context.normaliser, learner.act, params),
         config.eval.episodes,
         config.skills.horizon,
         config.policy.every_updates,
     )
-    return _offline_phase(task, "policy", learner, config.policy.updates, evaluation)
+    return _offline_phase(context, "policy", learner, config.policy.updates, evaluation)
 
 
-def value_phase(
-    config: Config, env: Any, dataset: Dataset, data: DeviceData, population: Population
-) -> GraphPhase | ValuePhase:
-    """The phase that finds the segments' advantages, by ``config.values.estimator``."""
+def value_phase(config: Config, env: Sizes, ends: np.ndarray) -> GraphPhase | ValuePhase:
+    """Return the phase that finds the segments' advantages, by ``config.values.estimator``.
+
+    Args:
+        config: the run's configuration.
+        env: the task.
+        ends: bool[N], the last row of each episode of the data.
+    """
     if config.values.estimator == "graph":
-        return GraphPhase(config.values, config.skills, data, dataset.ends, population.members)
-    return ValuePhase(config, data, population, IQL(env.observation_size, env.action_size, config.values.hidden))
+        return GraphPhase(config.values, config.skills, ends)
+    return ValuePhase(config, IQL(env.observation_size, env.action_size, config.values.hidden))
 
 
-def _skill_model(config: Config, env: Any) -> SkillModel:
-    skills = config.skills
-    return SkillModel(
-        env.observation_size,
-        env.action_size,
-        skills.latent_dim,
-        skills.encoder_hidden,
-        skills.encoder_layers,
-        skills.decoder_hidden,
-        skills.prior_hidden,
-    )
-
-
-def _weights(config: Config, recipe: Recipe, env: Any) -> SegmentWeights:
-    if not recipe.weighted:
+def _weights(config: Config, method: Recipe, env: Sizes) -> SegmentWeights:
+    if not method.weighted:
         return UniformWeights()
     if config.skills.advantage != "latent":
         return LoggedWeights()
@@ -292,28 +292,27 @@ def _weights(config: Config, recipe: Recipe, env: Any) -> SegmentWeights:
     return LatentWeights(env.observation_size, skills.latent_dim, config.values.hidden, skills.advantage_scale)
 
 
-def _information(
-    config: Config, recipe: Recipe, env: Any, model: SkillModel, normaliser: Normaliser, data: DeviceData
-) -> Information | None:
-    if not recipe.information:
+def _information(context: BuildContext, model: SkillModel) -> Information | None:
+    skills = context.config.skills
+    if not context.method.information:
         return None
-    if config.skills.mi_rollout == "logged":
-        return LoggedStates(config.skills.horizon)
-    return PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
+    if skills.mi_rollout == "logged":
+        return LoggedStates(skills.horizon)
+    return PhysicsRollout(context.env, model, context.normaliser, skills.horizon, context.data)
 
 
-def _labeller(config: Config, env: Any, source: SkillSource) -> OfflineReward:
-    labels = config.labels
+def _labeller(context: BuildContext, low_level: LowLevelPolicy) -> OfflineReward:
+    labels = context.config.labels
     if labels.offline_reward == "data":
         return DataReward()
-    model = RewardModel(env.observation_size + source.width, labels.reward_hidden)
+    model = RewardModel(context.env.observation_size + low_level.width, labels.reward_hidden)
     if labels.offline_reward == "pred":
         return PredictedReward(model)
-    return MinimumReward(model, config.skills.horizon)
+    return MinimumReward(model, context.config.skills.horizon, float(context.dataset.rewards.min()))
 
 
-def _bonus(config: Config, env: Any, source: SkillSource) -> Bonus:
+def _bonus(config: Config, env: Sizes, low_level: LowLevelPolicy) -> Bonus:
     labels = config.labels
     if labels.rnd_coefficient == 0:
         return NoBonus()
-    return RNDBonus(RND(env.observation_size + source.width, labels.rnd_hidden, labels.rnd_features))
+    return RNDBonus(RND(env.observation_size + low_level.width, labels.rnd_hidden, labels.rnd_features))

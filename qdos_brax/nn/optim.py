@@ -12,10 +12,10 @@ Params = Any
 ADAM = optax.scale_by_adam()
 
 
-def adam_step(params: Params, moments: optax.OptState, grads: Params, learning_rate: Any) -> tuple[Params, Any]:
-    """One Adam step with a learning rate that may be traced: (new parameters, new moments)."""
-    updates, moments = ADAM.update(grads, moments, params)
-    return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), moments
+def adam_step(params: Params, opt_state: optax.OptState, grads: Params, learning_rate: Any) -> tuple[Params, Any]:
+    """One Adam step with a learning rate that may be traced: (new parameters, new optimiser state)."""
+    updates, opt_state = ADAM.update(grads, opt_state, params)
+    return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), opt_state
 
 
 def polyak(target: Params, params: Params, rate: jax.Array | float) -> Params:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from qdos_brax.config import PolicyConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.offline.policy import GaussianPolicy, Params, weighted_imitation_loss
@@ -17,10 +17,10 @@ from qdos_brax.offline.rows import random_rows
 
 
 class BCState(struct.PyTreeNode):
-    """Parameters of the policy and Adam's moments."""
+    """Parameters of the policy and Adam's state."""
 
     actor: Params
-    moments: optax.OptState
+    opt_state: optax.OptState
 
 
 class BC:
@@ -29,8 +29,7 @@ class BC:
     Args:
         observation_dim: width of observations.
         action_dim: width of actions.
-        hidden: hidden widths of the policy.
-        batch_size: transitions per gradient step.
+        config: widths and batch size.
         learned_std: a Gaussian policy; False makes it deterministic (least squares).
     """
 
@@ -38,12 +37,11 @@ class BC:
         self,
         observation_dim: int,
         action_dim: int,
-        hidden: Sequence[int],
-        batch_size: int,
+        config: PolicyConfig,
         learned_std: bool = True,
     ) -> None:
-        self.observation_dim, self.action_dim, self.batch_size = observation_dim, action_dim, batch_size
-        self.policy = GaussianPolicy(tuple(hidden), action_dim, learned_std)
+        self.observation_dim, self.action_dim, self.batch_size = observation_dim, action_dim, config.batch_size
+        self.policy = GaussianPolicy(config.hidden, action_dim, learned_std)
 
     def init(self, key: jax.Array) -> BCState:
         """Fresh parameters."""
@@ -63,8 +61,8 @@ class BC:
             return weighted_imitation_loss(self.policy, actor, observation, action, 1.0)
 
         value, grads = jax.value_and_grad(loss)(state.actor)
-        actor, moments = adam_step(state.actor, state.moments, grads, learning_rate)
-        return BCState(actor, moments), {"actor_loss": value}
+        actor, opt_state = adam_step(state.actor, state.opt_state, grads, learning_rate)
+        return BCState(actor, opt_state), {"actor_loss": value}
 
     def update(
         self, state: BCState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]

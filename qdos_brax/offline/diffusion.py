@@ -18,6 +18,7 @@ import numpy as np
 import optax
 from flax import struct
 
+from qdos_brax.config import GuideConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.nn.optim import ADAM, adam_step, polyak
 from qdos_brax.offline.rows import random_rows
@@ -91,11 +92,11 @@ class Denoiser(nn.Module):
 
 
 class DiffusionState(struct.PyTreeNode):
-    """Parameters of the denoiser, their moving average, and Adam's moments."""
+    """Parameters of the denoiser, their moving average, and Adam's state."""
 
     denoiser: Params
     average: Params
-    moments: optax.OptState
+    opt_state: optax.OptState
 
 
 class DiffusionHyper(struct.PyTreeNode):
@@ -111,9 +112,7 @@ class DiffusionBC:
     Args:
         observation_dim: width of observations.
         action_dim: width of actions, which lie in [-1, 1].
-        hidden: width of the denoiser's residual blocks.
-        steps: K, denoising steps.
-        batch_size: transitions per gradient step.
+        config: width of the denoiser's residual blocks, denoising steps K, and batch size.
         blocks: residual blocks.
         dropout: share of units dropped in training.
     """
@@ -122,16 +121,14 @@ class DiffusionBC:
         self,
         observation_dim: int,
         action_dim: int,
-        hidden: int,
-        steps: int,
-        batch_size: int,
+        config: GuideConfig,
         blocks: int = 3,
         dropout: float = 0.1,
     ) -> None:
-        self.observation_dim, self.action_dim, self.batch_size = observation_dim, action_dim, batch_size
-        self.steps = steps
-        self.schedule = variance_preserving_schedule(steps)
-        self._denoiser = Denoiser(hidden, blocks, action_dim, dropout)
+        self.observation_dim, self.action_dim, self.batch_size = observation_dim, action_dim, config.batch_size
+        self.steps = config.steps
+        self.schedule = variance_preserving_schedule(config.steps)
+        self._denoiser = Denoiser(config.hidden, blocks, action_dim, dropout)
 
     def init(self, key: jax.Array) -> DiffusionState:
         """Fresh parameters; the average starts as a copy."""
@@ -153,9 +150,9 @@ class DiffusionBC:
     ) -> tuple[DiffusionState, dict[str, jax.Array]]:
         """One gradient step on observation[B, obs], action[B, act]; the average follows."""
         loss, grads = jax.value_and_grad(self.loss)(state.denoiser, observation, action, key)
-        denoiser, moments = adam_step(state.denoiser, state.moments, grads, hyper.learning_rate)
+        denoiser, opt_state = adam_step(state.denoiser, state.opt_state, grads, hyper.learning_rate)
         average = polyak(state.average, denoiser, hyper.average_rate)
-        return DiffusionState(denoiser, average, moments), {"denoising_loss": loss}
+        return DiffusionState(denoiser, average, opt_state), {"denoising_loss": loss}
 
     def sample(self, params: dict[str, Any], key: jax.Array, observation: jax.Array) -> jax.Array:
         """An action[..., act] in [-1, 1] of pi(a | s), by K denoising steps; ``observation`` is normalised.

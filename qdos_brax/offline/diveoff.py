@@ -15,7 +15,6 @@ and the target's action has the policy's narrow spread, not 1. Its cosine decay 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -23,6 +22,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from qdos_brax.config import DiveOffConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.nn.networks import MLP, DiagonalGaussian, Ensemble, gaussian_kl, gaussian_log_prob, gaussian_sample
 from qdos_brax.nn.optim import ADAM, adam_step, polyak
@@ -32,7 +32,6 @@ from qdos_brax.offline.rows import random_rows, transitions
 from qdos_brax.skills.values import ValueBatch
 
 Params = Any
-BOX = 2.0  # half the side of the box of random z
 CRITIC_STEPS = 2  # per step of actor and autoencoder
 _ACTION_STD = 0.082  # exp(-2.5), of the action whose value the critic is trained on
 
@@ -48,6 +47,7 @@ class DiveOffHyper(struct.PyTreeNode):
         scale: of the advantage in the weights.
         kl_weight: of KL(q(z | s, a) || N(0, 1)), against a mean squared error of reconstruction.
         information: weight of the information term.
+        latent_box: half the side of the box that random z are drawn from.
     """
 
     learning_rate: jax.Array | float
@@ -57,12 +57,13 @@ class DiveOffHyper(struct.PyTreeNode):
     scale: jax.Array | float
     kl_weight: jax.Array | float
     information: jax.Array | float
+    latent_box: jax.Array | float
 
 
 class DiveOffState(struct.PyTreeNode):
-    """Parameters of all networks, targets, Adam's moments, and the updates done.
+    """Parameters of all networks, targets, Adam's state, and the updates done.
 
-    ``shared_moments`` are those of the step on encoder, decoder and actor together.
+    ``shared_opt_state`` are those of the step on encoder, decoder and actor together.
     """
 
     actor: Params
@@ -70,9 +71,9 @@ class DiveOffState(struct.PyTreeNode):
     critic: Params
     target_critic: Params
     autoencoder: Params
-    actor_moments: optax.OptState
-    critic_moments: optax.OptState
-    shared_moments: optax.OptState
+    actor_opt_state: optax.OptState
+    critic_opt_state: optax.OptState
+    shared_opt_state: optax.OptState
     count: jax.Array
 
 
@@ -83,26 +84,17 @@ class DiveOff:
         observation_dim: width of observations.
         action_dim: width of actions.
         latent_dim: dimension of z.
-        hidden: hidden widths of all networks.
-        batch_size: transitions per gradient step.
-        autoencoder_updates: first updates, in which every transition counts the same and there is no information term.
+        config: widths, batch size, and the number of first updates in which every transition counts the same and there
+            is no information term.
     """
 
-    def __init__(
-        self,
-        observation_dim: int,
-        action_dim: int,
-        latent_dim: int,
-        hidden: Sequence[int],
-        batch_size: int,
-        autoencoder_updates: int = 10_000,
-    ) -> None:
+    def __init__(self, observation_dim: int, action_dim: int, latent_dim: int, config: DiveOffConfig) -> None:
         self.observation_dim, self.action_dim, self.latent_dim = observation_dim, action_dim, latent_dim
-        self.batch_size, self.autoencoder_updates = batch_size, autoencoder_updates
-        self.policy = GaussianPolicy(tuple(hidden), action_dim, learned_std=False)
-        self._critic = Ensemble(tuple(hidden), size=2)
-        self._encoder = DiagonalGaussian(tuple(hidden), latent_dim)
-        self._decoder = MLP((*hidden, observation_dim + action_dim))
+        self.batch_size, self.autoencoder_updates = config.batch_size, config.autoencoder_updates
+        self.policy = GaussianPolicy(config.hidden, action_dim, learned_std=False)
+        self._critic = Ensemble(config.hidden, size=2)
+        self._encoder = DiagonalGaussian(config.hidden, latent_dim)
+        self._decoder = MLP((*config.hidden, observation_dim + action_dim))
 
     def init(self, key: jax.Array) -> DiveOffState:
         """Fresh parameters; the targets start as copies."""
@@ -120,9 +112,9 @@ class DiveOff:
             critic=critic,
             target_critic=jax.tree.map(jnp.copy, critic),
             autoencoder=autoencoder,
-            actor_moments=ADAM.init(actor),
-            critic_moments=ADAM.init(critic),
-            shared_moments=ADAM.init((autoencoder, actor)),
+            actor_opt_state=ADAM.init(actor),
+            critic_opt_state=ADAM.init(critic),
+            shared_opt_state=ADAM.init((autoencoder, actor)),
             count=jnp.zeros((), jnp.int32),
         )
 
@@ -166,8 +158,8 @@ class DiveOff:
             return jnp.mean(jnp.sum(error**2, axis=0))
 
         value, grads = jax.value_and_grad(loss)(state.critic)
-        critic, moments = adam_step(state.critic, state.critic_moments, grads, hyper.learning_rate)
-        return state.replace(critic=critic, critic_moments=moments), value
+        critic, opt_state = adam_step(state.critic, state.critic_opt_state, grads, hyper.learning_rate)
+        return state.replace(critic=critic, critic_opt_state=opt_state), value
 
     def advantage(self, state: DiveOffState, batch: ValueBatch, latent: jax.Array, key: jax.Array) -> jax.Array:
         """min Q(s, a, z) - min Q(s, a', z) with a' ~ pi(. | s, z), [B], all of the targets."""
@@ -218,8 +210,8 @@ class DiveOff:
             return weighted_imitation_loss(self.policy, actor, seen, batch.action, weight)
 
         imitation, grads = jax.value_and_grad(actor_loss)(state.actor)
-        actor, actor_moments = adam_step(state.actor, state.actor_moments, grads, hyper.learning_rate)
-        random = jax.random.uniform(random_key, latent.shape, minval=-BOX, maxval=BOX)
+        actor, actor_opt_state = adam_step(state.actor, state.actor_opt_state, grads, hyper.learning_rate)
+        random = jax.random.uniform(random_key, latent.shape, minval=-hyper.latent_box, maxval=hyper.latent_box)
 
         def shared_loss(shared: tuple[Params, Params]) -> tuple[jax.Array, jax.Array]:
             autoencoder, actor = shared
@@ -229,14 +221,15 @@ class DiveOff:
 
         (loss, information), grads = jax.value_and_grad(shared_loss, has_aux=True)((state.autoencoder, actor))
         rate = hyper.autoencoder_rate * hyper.learning_rate
-        (autoencoder, actor), shared_moments = adam_step((state.autoencoder, actor), state.shared_moments, grads, rate)
+        shared, shared_opt_state = adam_step((state.autoencoder, actor), state.shared_opt_state, grads, rate)
+        autoencoder, actor = shared
         state = state.replace(
             actor=actor,
             target_actor=polyak(state.target_actor, actor, hyper.target_rate),
             target_critic=polyak(state.target_critic, state.critic, hyper.target_rate),
             autoencoder=autoencoder,
-            actor_moments=actor_moments,
-            shared_moments=shared_moments,
+            actor_opt_state=actor_opt_state,
+            shared_opt_state=shared_opt_state,
             count=state.count + 1,
         )
         info = {"actor_loss": imitation, "autoencoder_loss": loss, "information_loss": information}
@@ -248,9 +241,10 @@ class DiveOff:
         """Two critic steps and one of everything else, on batches of the data.
 
         Reads ``diveoff.learning_rate``, ``.autoencoder_rate``, ``.discount``, ``.target_rate``, ``.scale``,
-        ``.kl_weight`` and ``.information``.
+        ``.kl_weight``, ``.information`` and ``skills.latent_box``.
         """
-        own = DiveOffHyper(**{name: hyper[f"diveoff.{name}"] for name in DiveOffHyper.__dataclass_fields__})
+        names = [name for name in DiveOffHyper.__dataclass_fields__ if name != "latent_box"]
+        own = DiveOffHyper(**{name: hyper[f"diveoff.{name}"] for name in names}, latent_box=hyper["skills.latent_box"])
         policy_key, *critic_keys = jax.random.split(key, CRITIC_STEPS + 1)
 
         def critic_step(state: DiveOffState, key: jax.Array) -> tuple[DiveOffState, jax.Array]:

@@ -9,7 +9,6 @@ phi and 0.9 for the skills, beta 10, discount 0.99, d = 32, 10^6 updates (kitche
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +16,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from qdos_brax.config import HilbertConfig, PolicyConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.nn.networks import MLP
 from qdos_brax.nn.optim import ADAM, adam_step, polyak
@@ -60,11 +60,11 @@ class HilbertHyper(struct.PyTreeNode):
 
 
 class HilbertState(struct.PyTreeNode):
-    """phi's two heads (first axis of every leaf), their target, Adam's moments, and the learner of skills."""
+    """phi's two heads (first axis of every leaf), their target, Adam's state, and the learner of skills."""
 
     phi: Params
     target_phi: Params
-    phi_moments: optax.OptState
+    phi_opt_state: optax.OptState
     skills: IQLPolicyState
 
 
@@ -95,25 +95,16 @@ class Hilbert:
         observation_dim: width of observations.
         action_dim: width of actions.
         latent_dim: dimension of phi and of z.
-        hidden: hidden widths of all networks.
-        batch_size: transitions per gradient step.
-        random_goals: share of goals that are any state of the data; the others lie ahead in the same episode.
+        config: widths of all networks, batch size, and share of random goals.
     """
 
-    def __init__(
-        self,
-        observation_dim: int,
-        action_dim: int,
-        latent_dim: int,
-        hidden: Sequence[int],
-        batch_size: int,
-        random_goals: float = 0.375,
-    ) -> None:
+    def __init__(self, observation_dim: int, action_dim: int, latent_dim: int, config: HilbertConfig) -> None:
         self.observation_dim, self.latent_dim = observation_dim, latent_dim
-        self.batch_size, self.random_goals = batch_size, random_goals
-        self._phi = MLP((*hidden, latent_dim), layer_norm=True)
+        self.batch_size, self.random_goals = config.batch_size, config.random_goals
+        self._phi = MLP((*config.hidden, latent_dim), layer_norm=True)
         width = observation_dim + latent_dim
-        self.skills = IQLPolicy(width, action_dim, hidden, IQL(width, action_dim, hidden), batch_size)
+        policy = PolicyConfig(hidden=config.hidden, batch_size=config.batch_size)
+        self.skills = IQLPolicy(width, action_dim, policy, IQL(width, action_dim, config.hidden))
 
     def init(self, key: jax.Array) -> HilbertState:
         """Fresh parameters; the target starts as a copy."""
@@ -180,13 +171,13 @@ class Hilbert:
     ) -> tuple[HilbertState, dict[str, jax.Array]]:
         """One step of phi and its target on ``batch``, and one of the skills ``latent``[B, d] on its transitions."""
         loss, grads = jax.value_and_grad(self.distance_loss)(state.phi, state.target_phi, batch, hyper)
-        phi, moments = adam_step(state.phi, state.phi_moments, grads, hyper.learning_rate)
+        phi, opt_state = adam_step(state.phi, state.phi_opt_state, grads, hyper.learning_rate)
         target_phi = polyak(state.target_phi, phi, hyper.target_rate)
         values = ValueHyper(hyper.learning_rate, hyper.skill_expectile, hyper.target_rate)
         skill_hyper = IQLPolicyHyper(values, hyper.learning_rate, hyper.inverse_temperature)
         seen = self.skill_batch(state.phi, batch, latent, hyper.discount)
         skills, info = self.skills.step(state.skills, seen, skill_hyper)
-        return HilbertState(phi, target_phi, moments, skills), info | {"distance_loss": loss}
+        return HilbertState(phi, target_phi, opt_state, skills), info | {"distance_loss": loss}
 
     def update(
         self, state: HilbertState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]

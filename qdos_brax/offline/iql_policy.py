@@ -6,7 +6,6 @@ expectile 0.9, beta 10; for its kitchen 0.7 and 0.5; for OGBench (Park et al. 20
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from qdos_brax.config import PolicyConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.offline.policy import GaussianPolicy, Params, weighted_imitation_loss
@@ -32,11 +32,11 @@ class IQLPolicyHyper(struct.PyTreeNode):
 
 
 class IQLPolicyState(struct.PyTreeNode):
-    """Values, the policy's parameters, and Adam's moments for them."""
+    """Values, the policy's parameters, and Adam's states."""
 
     values: ValueState
     actor: Params
-    moments: optax.OptState
+    opt_state: optax.OptState
 
 
 def regression_weight(advantage: jax.Array, inverse_temperature: jax.Array | float) -> jax.Array:
@@ -50,17 +50,14 @@ class IQLPolicy:
     Args:
         observation_dim: width of observations.
         action_dim: width of actions.
-        hidden: hidden widths of the policy.
+        config: widths of the policy, and batch size.
         values: the learner of V and Q.
-        batch_size: transitions per gradient step.
     """
 
-    def __init__(
-        self, observation_dim: int, action_dim: int, hidden: Sequence[int], values: IQL, batch_size: int
-    ) -> None:
-        self.observation_dim, self.batch_size = observation_dim, batch_size
+    def __init__(self, observation_dim: int, action_dim: int, config: PolicyConfig, values: IQL) -> None:
+        self.observation_dim, self.batch_size = observation_dim, config.batch_size
         self.values = values
-        self.policy = GaussianPolicy(tuple(hidden), action_dim)
+        self.policy = GaussianPolicy(config.hidden, action_dim)
 
     def init(self, key: jax.Array) -> IQLPolicyState:
         """Fresh parameters."""
@@ -89,9 +86,9 @@ class IQLPolicy:
             return weighted_imitation_loss(self.policy, actor, batch.observation, batch.action, weight)
 
         actor_loss, grads = jax.value_and_grad(loss)(state.actor)
-        actor, moments = adam_step(state.actor, state.moments, grads, hyper.learning_rate)
+        actor, opt_state = adam_step(state.actor, state.opt_state, grads, hyper.learning_rate)
         info |= {"actor_loss": actor_loss, "policy_weight": jnp.mean(weight)}
-        return IQLPolicyState(values, actor, moments), info
+        return IQLPolicyState(values, actor, opt_state), info
 
     def update(
         self, state: IQLPolicyState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]

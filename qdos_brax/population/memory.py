@@ -24,12 +24,12 @@ _GB = 1e9
 class Sized(Protocol):
     """A phase whose memory can be told before it runs."""
 
-    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> Any:
-        """The state before the first chunk."""
+    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[Any, Any]:
+        """Return the state before the first chunk, and the constants of all chunks."""
         ...
 
-    def working_bytes(self, state: Any) -> int:
-        """What a chunk needs beside the state (which may be shapes alone), and beside what it is given."""
+    def working_bytes(self, state: Any, constants: Any) -> int:
+        """Return what a chunk needs beside its arguments, which may be shapes alone."""
         ...
 
     def finish(self, state: Any, artifacts: dict[str, Any]) -> dict[str, Any]:
@@ -38,7 +38,7 @@ class Sized(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Estimate:
+class MemoryEstimate:
     """Bytes.
 
     Attributes:
@@ -53,7 +53,7 @@ class Estimate:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class MemoryPlan:
     """How the members run.
 
     Attributes:
@@ -69,7 +69,7 @@ class Plan:
     line: str
 
 
-def estimate(phases: Sequence[Sized], shared: int) -> Estimate:
+def estimate(phases: Sequence[Sized], shared: int) -> MemoryEstimate:
     """The largest need of the phases of a population of one; nothing is compiled and nothing runs.
 
     Args:
@@ -80,15 +80,15 @@ def estimate(phases: Sequence[Sized], shared: int) -> Estimate:
     artifacts: dict[str, Any] = {}
     kept = working = 0
     for phase in phases:
-        state = jax.eval_shape(lambda key, phase=phase, given=artifacts: phase.init(key, given), key)
+        state, constants = jax.eval_shape(lambda key, phase=phase, given=artifacts: phase.init(key, given), key)
         kept = max(kept, num_bytes(state) + num_bytes(artifacts))
-        working = max(working, phase.working_bytes(state))
+        working = max(working, phase.working_bytes(state, constants))
         artifacts = jax.eval_shape(phase.finish, state, artifacts)
         artifacts.pop(health.KEY, None)  # a copy is made of it, and shapes cannot be copied
-    return Estimate(shared, kept, working)
+    return MemoryEstimate(shared, kept, working)
 
 
-def plan(need: Estimate, members: int, devices: Sequence[jax.Device], room: int, wanted: int) -> Plan:
+def plan(need: MemoryEstimate, members: int, devices: Sequence[jax.Device], room: int, wanted: int) -> MemoryPlan:
     """How ``members`` run on ``devices``.
 
     Args:
@@ -123,7 +123,7 @@ def plan(need: Estimate, members: int, devices: Sequence[jax.Device], room: int,
         words.append("states wait in host memory")
     if at_once > room:
         words.append("which may be too little")
-    return Plan(tuple(devices[:used]), per_program, parked, ", ".join(words))
+    return MemoryPlan(tuple(devices[:used]), per_program, parked, ", ".join(words))
 
 
 def room_of(device: jax.Device) -> int:

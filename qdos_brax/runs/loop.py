@@ -40,11 +40,11 @@ class Phase(Protocol):
     part: str
     num_chunks: int
 
-    def init(self, key: jax.Array, artifacts: Artifacts) -> Any:
-        """The state before the first chunk, a pytree of arrays.
+    def init(self, key: jax.Array, artifacts: Artifacts) -> tuple[Any, Any]:
+        """Return the state before the first chunk, a pytree of arrays, and the constants that every chunk reads.
 
-        It is called on resume too, and the state it makes is then replaced by the saved one. So it may keep on
-        ``self`` what no chunk changes (data, frozen parameters): that is not saved again with every checkpoint.
+        It is called on resume too: the state is then replaced by the saved one, and the constants, which no checkpoint
+        holds, are those that it makes.
 
         Args:
             key: typed keys[members], one per member, for this phase alone.
@@ -52,8 +52,8 @@ class Phase(Protocol):
         """
         ...
 
-    def chunk(self, state: Any) -> tuple[Any, dict[str, Any]]:
-        """The state after one chunk, and its log point.
+    def chunk(self, state: Any, constants: Any) -> tuple[Any, dict[str, Any]]:
+        """Return the state after one chunk, and its log point.
 
         The state may be donated. A metric is a scalar or one number per member: "env_steps" and "update" (counts so
         far), "eval/success", "eval/return", "eval/episodes", "first_goal_step" (nan until reached), "status_ok"
@@ -69,12 +69,12 @@ class Phase(Protocol):
 
 @dataclasses.dataclass
 class _Place:
-    """Where the loop is; ``state`` is None at the start of a phase."""
+    """Where the loop is; ``state`` is None at the start of a phase, else (state, constants)."""
 
     phase: int
     chunk: int
     artifacts: Artifacts
-    state: Any | None
+    state: tuple[Any, Any] | None
 
 
 def run_phases(
@@ -142,13 +142,11 @@ class _Runner:
 
     def run(self, phase: Phase, place: _Place) -> _Place:
         """Runs the phase from ``place`` to its end; the place where the next one starts."""
-        state = place.state
-        if state is None:
-            state = phase.init(_phase_keys(self.keys, place.phase), place.artifacts)
+        state, constants = place.state or phase.init(_phase_keys(self.keys, place.phase), place.artifacts)
         saved_at, pause = time.monotonic(), self.checkpoint_seconds
         with Progress(phase.name, phase.num_chunks, place.chunk, below=self.board) as progress:
             for chunk in range(place.chunk, phase.num_chunks):
-                state = self._chunk(phase, state, chunk, progress)
+                state = self._chunk(phase, state, constants, chunk, progress)
                 stop = bool(self.caught)
                 last = chunk + 1 == phase.num_chunks
                 if stop or (not last and time.monotonic() - saved_at >= pause):
@@ -158,7 +156,7 @@ class _Runner:
                 if stop:
                     self._stop()
         artifacts = checkpoint.as_device_arrays(phase.finish(state, place.artifacts))
-        del state
+        del state, constants
         self.clock.charge(phase.part)
         self.store.save_artifacts(place.phase + 1, artifacts)
         self._save(place.phase + 1, 0, None)
@@ -166,10 +164,10 @@ class _Runner:
             self._stop()
         return _Place(place.phase + 1, 0, artifacts, None)
 
-    def _chunk(self, phase: Phase, state: Any, chunk: int, progress: Progress) -> Any:
+    def _chunk(self, phase: Phase, state: Any, constants: Any, chunk: int, progress: Progress) -> Any:
         before = {name: _mean(self.table.latest(name)) if chunk else 0.0 for name in ("env_steps", "update")}
         started = time.perf_counter()
-        state, metrics = phase.chunk(state)
+        state, metrics = phase.chunk(state, constants)
         metrics = dict(metrics)
         eval_seconds = float(metrics.pop("eval_seconds", 0.0))
         self.clock.charge(phase.part, eval_seconds)
@@ -243,7 +241,8 @@ def _restore(
     artifacts = store.artifacts(saved.phase)
     state = None
     if not store.is_phase_start(name):
-        state = store.restore(name, phases[saved.phase].init(_phase_keys(keys, saved.phase), artifacts))
+        like, constants = phases[saved.phase].init(_phase_keys(keys, saved.phase), artifacts)
+        state = store.restore(name, like), constants
     try:
         table.cut_back(saved.rows, saved.columns)
     except UserError as error:

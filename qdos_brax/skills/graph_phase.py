@@ -1,4 +1,4 @@
-"""The first phase, by default: how far every logged state is from success, on a graph of logged states."""
+"""The value phase by default: how far every logged state is from success, on a graph of logged states."""
 
 from __future__ import annotations
 
@@ -11,49 +11,47 @@ import numpy as np
 
 from qdos_brax.config import SkillsConfig, ValuesConfig
 from qdos_brax.data.device import DeviceData
+from qdos_brax.population.members import Population
+from qdos_brax.population.phase import MemberPhase
 from qdos_brax.skills.slow_features import slow_features
 from qdos_brax.skills.state_graph import costs_to_go, step_costs
 from qdos_brax.skills.value_phase import segment_advantages
 from qdos_brax.skills.weights import scaled_advantage
 
 
-class GraphPhase:
-    """Shortest paths on the host, in one chunk; nothing is random, so all members share what it finds.
+class GraphPhase(MemberPhase):
+    """Find shortest paths on the host, in one chunk; nothing is random, so all members share what it finds.
 
     Args:
         values: how the graph is made.
         skills: length of a segment, and scale of its advantage.
-        data: the data set on the device.
         ends: bool[N], the last row of each episode.
-        members: of the population.
     """
 
-    name = "values"
-    part = "pretrain"
-    num_chunks = 1
+    def __init__(self, values: ValuesConfig, skills: SkillsConfig, ends: np.ndarray) -> None:
+        super().__init__("values", "pretrain", 1)
+        self._values, self._skills, self._ends = values, skills, np.asarray(ends, bool)
 
-    def __init__(
-        self, values: ValuesConfig, skills: SkillsConfig, data: DeviceData, ends: np.ndarray, members: int
-    ) -> None:
-        self._values, self._skills = values, skills
-        self._data, self._ends, self._members = data, np.asarray(ends, bool), members
+    def bind(self, population: Population, data: DeviceData) -> None:
+        """Keep the data and the number of members; there is nothing to compile."""
+        self._data, self._members = data, population.members
 
-    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> jax.Array:
-        """float32[members, N], the value of every logged state, yet to be found."""
-        return jnp.zeros((self._members, self._data.rewards.shape[0]))
+    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[jax.Array, dict[str, Any]]:
+        """Return float32[members, N], the value of every logged state, yet to be found, and no constants."""
+        return jnp.zeros((self._members, self._data.rewards.shape[0])), {}
 
-    def chunk(self, state: jax.Array) -> tuple[jax.Array, dict[str, np.ndarray]]:
-        """Finds it: minus the cost of the way to success."""
+    def chunk(self, state: jax.Array, constants: dict[str, Any]) -> tuple[jax.Array, dict[str, np.ndarray]]:
+        """Return the values: minus the cost of the way to success."""
         costs = graph_costs(self._values, self._skills.horizon, self._data, self._ends)
         found = {"update": np.ones(self._members), "cost_to_go": np.full(self._members, costs.mean())}
         return jnp.tile(-jnp.asarray(costs), (self._members, 1)), found
 
-    def working_bytes(self, state: Any) -> int:
-        """The search is the host's: nothing."""
+    def working_bytes(self, state: Any, constants: Any) -> int:
+        """Return 0: the search is the host's."""
         return 0
 
     def finish(self, state: jax.Array, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Adds the scaled advantage of every segment, float32[members, S].
+        """Return the artifacts with the scaled advantage of every segment, float32[members, S].
 
         Data goes on after a success, and so does this task: to stay there costs nothing, to leave it is a loss. Where
         an episode ends, the value after its last row is that row's, for the state behind it is no row of the data.

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from qdos_brax.data.device import MacroRows
 from qdos_brax.nn.networks import Ensemble
 from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.skills.weights import scaled_advantage
@@ -23,12 +22,12 @@ class SegmentBatch(NamedTuple):
 
     Attributes:
         segment: int32[B], into the list of all segments.
-        rows: the segments as macro transitions.
+        observation: float32[B, obs], their first observations, normalised.
         latent: gives the posterior's mean[B, z]; a function, so that only who needs it pays for it.
     """
 
     segment: jax.Array
-    rows: MacroRows
+    observation: jax.Array
     latent: Callable[[], jax.Array]
 
 
@@ -91,9 +90,9 @@ class LatentWeights:
         self._scale = scale
 
     def init(self, key: jax.Array) -> dict[str, Any]:
-        """Fresh parameters of f's two heads and Adam's moments."""
+        """Fresh parameters of f's two heads and Adam's state."""
         params = self._gain.init(key, jnp.zeros((1, self._width)))
-        return {"params": params, "moments": ADAM.init(params)}
+        return {"params": params, "opt_state": ADAM.init(params)}
 
     def learn(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any], hyper: dict[str, Any]) -> Any:
         """Regresses both heads on the segments' own advantages."""
@@ -104,8 +103,8 @@ class LatentWeights:
             return jnp.mean(jnp.sum((self._gain.apply(params, inputs) - target) ** 2, axis=0))
 
         grads = jax.grad(loss)(state["params"])
-        params, moments = adam_step(state["params"], state["moments"], grads, hyper["values.learning_rate"])
-        return {"params": params, "moments": moments}
+        params, opt_state = adam_step(state["params"], state["opt_state"], grads, hyper["values.learning_rate"])
+        return {"params": params, "opt_state": opt_state}
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
         """``smaller_head``, scaled over the batch."""
@@ -116,4 +115,4 @@ class LatentWeights:
         return self._gain.apply(state["params"], self._inputs(batch)).min(axis=0)
 
     def _inputs(self, batch: SegmentBatch) -> jax.Array:
-        return jax.lax.stop_gradient(jnp.concatenate([batch.rows.observation, batch.latent()], axis=-1))
+        return jax.lax.stop_gradient(jnp.concatenate([batch.observation, batch.latent()], axis=-1))

@@ -1,4 +1,4 @@
-"""The second phase: skills, by the weighted VAE and the mutual information between a skill and what it does."""
+"""The skill phase: the weighted VAE, and the mutual information between a skill and what it does."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import optax
 from flax import struct
 
 from qdos_brax.config import Config, SkillsConfig
-from qdos_brax.data.device import DeviceData, macro_rows
+from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import window
 from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.population import health
-from qdos_brax.population.members import Population
-from qdos_brax.population.memory import working_bytes
+from qdos_brax.population.phase import MemberPhase
 from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
@@ -45,7 +44,7 @@ class SkillPhaseState(struct.PyTreeNode):
     Attributes:
         key: typed key.
         params: of the skill model.
-        moments: Adam's, of ``params``.
+        opt_state: Adam's, of ``params``.
         weights: what the segment weights learn.
         update: gradient steps so far.
         broken: rollouts whose simulation broke; they are left out.
@@ -54,14 +53,14 @@ class SkillPhaseState(struct.PyTreeNode):
 
     key: jax.Array
     params: Any
-    moments: optax.OptState
+    opt_state: optax.OptState
     weights: Any
     update: jax.Array
     broken: jax.Array
     healthy: jax.Array
 
 
-class SkillPhase:
+class SkillPhase(MemberPhase):
     """The skill learner.
 
     A block of ``mi_every`` gradient steps shares one batch of rollouts of random skills (none when ``information`` is
@@ -69,78 +68,64 @@ class SkillPhase:
 
     Args:
         config: the run's configuration.
-        data: the data set on the device.
-        population: the members.
         model: posterior, prior and decoder.
         weights: where segment advantages come from.
         information: where the states of the mutual-information term come from, or None to leave the term out.
         blocks_per_chunk: blocks between two looks of the host.
     """
 
-    name = "skills"
-    part = "pretrain"
-
     def __init__(
         self,
         config: Config,
-        data: DeviceData,
-        population: Population,
         model: SkillModel,
         weights: SegmentWeights,
         information: Information | None,
         blocks_per_chunk: int = 10,
     ) -> None:
         self._skills: SkillsConfig = config.skills
-        self._data, self._hyper = data, population.hyper
         self._model, self._weights, self._information = model, weights, information
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
         self._blocks = min(blocks_per_chunk, total_blocks)
-        self.num_chunks = -(-total_blocks // self._blocks)
-        self._start = population.program(self._init)
-        self._chunk = population.program(self._train, carries=True)
+        super().__init__("skills", "pretrain", -(-total_blocks // self._blocks))
 
-    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> SkillPhaseState:
-        """Fresh networks for every member."""
-        self._artifacts = {name: artifacts[name] for name in ("advantage",) if name in artifacts}
-        state: SkillPhaseState = self._start(key, None)
-        return state.replace(healthy=health.inherited(artifacts, len(key)))
+    def constants(self, artifacts: dict[str, Any]) -> dict[str, Any]:
+        """Return the segments' advantages, where values were learned."""
+        return {name: artifacts[name] for name in ("advantage",) if name in artifacts}
 
-    def chunk(self, state: SkillPhaseState) -> tuple[SkillPhaseState, dict[str, np.ndarray]]:
-        """``blocks_per_chunk`` x ``mi_every`` gradient steps."""
-        state, info = self._chunk(state, self._hyper, self._artifacts, self._data)
-        metrics = {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
+    def metrics(self, state: SkillPhaseState, info: dict[str, np.ndarray]) -> dict[str, Any]:
+        """Return the columns of metrics.csv after a chunk, [members] each."""
         if self._information is not None:
-            metrics["broken_envs"] = np.asarray(state.broken)
-        return state, metrics | {"status_ok": np.asarray(state.healthy)}
-
-    def working_bytes(self, state: Any) -> int:
-        """What a chunk needs beside the state, which may be shapes alone."""
-        return working_bytes(self._chunk, state, self._hyper, self._artifacts, self._data)
+            info = info | {"broken_envs": np.asarray(state.broken)}
+        return super().metrics(state, info)
 
     def finish(self, state: SkillPhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Adds the skill model's parameters; the weights' own are done with."""
+        """Return the artifacts with the skill model's parameters; what the weights learned is dropped."""
         return artifacts | {"skills": state.params, health.KEY: state.healthy}
 
-    def _init(self, key: jax.Array, _: None) -> SkillPhaseState:
+    def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> SkillPhaseState:
+        """Return fresh networks."""
         model_key, weights_key, key = jax.random.split(key, 3)
         params = self._model.init(model_key)
         return SkillPhaseState(
             key=key,
             params=params,
-            moments=ADAM.init(params),
+            opt_state=ADAM.init(params),
             weights=self._weights.init(weights_key),
             update=jnp.zeros((), jnp.int32),
             broken=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),
         )
 
-    def _train(self, state: SkillPhaseState, hyper: Any, artifacts: Any, data: DeviceData) -> Any:
+    def train_member(
+        self, state: SkillPhaseState, constants: dict[str, Any], hyper: dict[str, jax.Array], data: DeviceData
+    ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
+        """Make ``blocks_per_chunk`` x ``mi_every`` gradient steps."""
         keys = jax.random.split(state.key, self._blocks + 1)
-        block = partial(self._block, data=data, hyper=hyper, artifacts=artifacts)
+        block = partial(self._block, data=data, hyper=hyper, artifacts=constants)
         after, info = jax.lax.scan(block, state, keys[1:])
         learned, healthy = health.keep_finite(state.healthy, _learned(after), _learned(state))
-        params, moments, weights = learned
-        state = after.replace(key=keys[0], params=params, moments=moments, weights=weights, healthy=healthy)
+        params, opt_state, weights = learned
+        state = after.replace(key=keys[0], params=params, opt_state=opt_state, weights=weights, healthy=healthy)
         return state, jax.tree.map(jnp.mean, info)
 
     def _block(
@@ -155,7 +140,7 @@ class SkillPhase:
         if self._information is not None:
             starts = data.starts[index]
             observations = self._information(state.params, data, starts, latent)
-            weight = self._weight(state, self._batch(state, data, index, hyper), artifacts, hyper)
+            weight = self._weight(state, self._batch(state, data, index), artifacts, hyper)
             # One simulation that broke must not cost the member: it is counted, and weighs nothing.
             finite = jnp.all(jnp.isfinite(observations), axis=(1, 2))
             observations = jnp.where(finite[:, None, None], observations, 0.0)
@@ -169,7 +154,7 @@ class SkillPhase:
     ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
         index_key, sample_key = jax.random.split(key)
         index = jax.random.randint(index_key, (self._skills.batch_size,), 0, data.starts.shape[0])
-        batch = self._batch(state, data, index, hyper)
+        batch = self._batch(state, data, index)
         state = state.replace(weights=self._weights.learn(state.weights, batch, artifacts, hyper))
         weight = self._weight(state, batch, artifacts, hyper)
         segments = self._segments(data, index)
@@ -184,18 +169,18 @@ class SkillPhase:
             return total + hyper["skills.alpha"] * information_loss, info | {"information_loss": information_loss}
 
         grads, info = jax.grad(loss, has_aux=True)(state.params)
-        params, moments = adam_step(state.params, state.moments, grads, hyper["skills.learning_rate"])
+        params, opt_state = adam_step(state.params, state.opt_state, grads, hyper["skills.learning_rate"])
         effective = jnp.sum(weight) ** 2 / jnp.sum(weight**2) / self._skills.batch_size
-        state = state.replace(params=params, moments=moments, update=state.update + 1)
+        state = state.replace(params=params, opt_state=opt_state, update=state.update + 1)
         return state, info | {"weight_ess": effective}
 
     def _segments(self, data: DeviceData, index: jax.Array) -> Segments:
         return Segments(*window((data.observations, data.actions), data.starts[index], self._skills.horizon))
 
-    def _batch(self, state: SkillPhaseState, data: DeviceData, index: jax.Array, hyper: Any) -> SegmentBatch:
-        rows = macro_rows(data, data.starts[index], self._skills.horizon, hyper["values.discount"])
+    def _batch(self, state: SkillPhaseState, data: DeviceData, index: jax.Array) -> SegmentBatch:
+        observation = data.observations[data.starts[index]]
         return SegmentBatch(
-            index, rows, latent=lambda: self._model.encode(state.params, self._segments(data, index)).mean
+            index, observation, latent=lambda: self._model.encode(state.params, self._segments(data, index)).mean
         )
 
     def _weight(self, state: SkillPhaseState, batch: SegmentBatch, artifacts: Any, hyper: Any) -> jax.Array:
@@ -204,4 +189,4 @@ class SkillPhase:
 
 
 def _learned(state: SkillPhaseState) -> tuple[Any, Any, Any]:
-    return state.params, state.moments, state.weights
+    return state.params, state.opt_state, state.weights

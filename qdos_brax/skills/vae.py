@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from qdos_brax.config import SkillsConfig
 from qdos_brax.nn.networks import DiagonalGaussian, SegmentEncoder, gaussian_kl, gaussian_log_prob, gaussian_sample
 
 Params = Any
@@ -33,27 +33,14 @@ class SkillModel:
     Args:
         observation_dim: width of observations.
         action_dim: width of actions.
-        latent_dim: dimension of z.
-        encoder_hidden: width of the bidirectional GRU.
-        encoder_layers: its number of layers.
-        decoder_hidden: hidden widths of the low-level policy.
-        prior_hidden: hidden widths of the state prior.
+        config: dimension of z and widths.
     """
 
-    def __init__(
-        self,
-        observation_dim: int,
-        action_dim: int,
-        latent_dim: int,
-        encoder_hidden: int,
-        encoder_layers: int,
-        decoder_hidden: Sequence[int],
-        prior_hidden: Sequence[int],
-    ) -> None:
-        self.observation_dim, self.action_dim, self.latent_dim = observation_dim, action_dim, latent_dim
-        self._encoder = SegmentEncoder(encoder_hidden, encoder_layers, latent_dim)
-        self._prior = DiagonalGaussian(tuple(prior_hidden), latent_dim)
-        self._decoder = DiagonalGaussian(tuple(decoder_hidden), action_dim)
+    def __init__(self, observation_dim: int, action_dim: int, config: SkillsConfig) -> None:
+        self.observation_dim, self.action_dim, self.latent_dim = observation_dim, action_dim, config.latent_dim
+        self._encoder = SegmentEncoder(config.encoder_hidden, config.encoder_layers, config.latent_dim)
+        self._prior = DiagonalGaussian(config.prior_hidden, config.latent_dim)
+        self._decoder = DiagonalGaussian(config.decoder_hidden, action_dim)
 
     def init(self, key: jax.Array) -> dict[str, Params]:
         """Fresh parameters: {"encoder", "prior", "decoder"}."""

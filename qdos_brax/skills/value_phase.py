@@ -1,4 +1,4 @@
-"""The first phase with implicit Q-learning: values, and from them the advantage of every segment of the data."""
+"""The value phase with implicit Q-learning: values, and from them the advantage of every segment of the data."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
 from qdos_brax.config import Config, SkillsConfig, ValuesConfig
@@ -16,7 +15,7 @@ from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import macro_return, window
 from qdos_brax.population import health
 from qdos_brax.population.members import Population
-from qdos_brax.population.memory import working_bytes
+from qdos_brax.population.phase import MemberPhase
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState
 from qdos_brax.skills.weights import scaled_advantage, segment_advantage, transition_advantage
 
@@ -32,57 +31,41 @@ class ValuePhaseState(struct.PyTreeNode):
     healthy: jax.Array
 
 
-class ValuePhase:
+class ValuePhase(MemberPhase):
     """IQL on the data set.
 
     Args:
         config: the run's configuration.
-        data: the data set on the device.
-        population: the members.
         iql: the learner.
         updates_per_chunk: gradient steps between two looks of the host.
     """
 
-    name = "values"
-    part = "pretrain"
-
-    def __init__(
-        self, config: Config, data: DeviceData, population: Population, iql: IQL, updates_per_chunk: int = 500
-    ) -> None:
+    def __init__(self, config: Config, iql: IQL, updates_per_chunk: int = 500) -> None:
         self._values: ValuesConfig = config.values
         self._skills: SkillsConfig = config.skills
-        self._data, self._hyper, self._iql = data, population.hyper, iql
+        self._iql = iql
         self._updates = min(updates_per_chunk, config.values.updates)
-        self.num_chunks = -(-config.values.updates // self._updates)
-        self._start = population.program(self._init)
-        self._chunk = population.program(self._train, carries=True)
+        super().__init__("values", "pretrain", -(-config.values.updates // self._updates))
+
+    def bind(self, population: Population, data: DeviceData) -> None:
+        """Compile the programs, that of the advantages included."""
+        super().bind(population, data)
         self._advantages = population.program(self._all_advantages)
 
-    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> ValuePhaseState:
-        """Fresh networks for every member."""
-        state: ValuePhaseState = self._start(key, None)
-        return state.replace(healthy=health.inherited(artifacts, len(key)))
-
-    def chunk(self, state: ValuePhaseState) -> tuple[ValuePhaseState, dict[str, np.ndarray]]:
-        """``updates_per_chunk`` gradient steps."""
-        state, info = self._chunk(state, self._hyper, self._data)
-        metrics = {"update": np.asarray(state.update), **jax.tree.map(np.asarray, info)}
-        return state, metrics | {"status_ok": np.asarray(state.healthy)}
-
-    def working_bytes(self, state: Any) -> int:
-        """What a chunk needs beside the state, which may be shapes alone."""
-        return working_bytes(self._chunk, state, self._hyper, self._data)
-
     def finish(self, state: ValuePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Adds the scaled advantage of every segment, float32[members, S]."""
+        """Return the artifacts with the scaled advantage of every segment, float32[members, S]."""
         advantage = self._advantages(state, self._hyper, self._data)
         return artifacts | {"advantage": advantage, health.KEY: state.healthy}
 
-    def _init(self, key: jax.Array, _: None) -> ValuePhaseState:
+    def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> ValuePhaseState:
+        """Return fresh networks."""
         init_key, key = jax.random.split(key)
         return ValuePhaseState(key, self._iql.init(init_key), jnp.zeros((), jnp.int32), jnp.ones((), bool))
 
-    def _train(self, state: ValuePhaseState, hyper: dict[str, jax.Array], data: DeviceData) -> Any:
+    def train_member(
+        self, state: ValuePhaseState, constants: dict[str, Any], hyper: dict[str, jax.Array], data: DeviceData
+    ) -> tuple[ValuePhaseState, dict[str, jax.Array]]:
+        """Make ``updates_per_chunk`` gradient steps."""
         value_hyper = ValueHyper(hyper["values.learning_rate"], hyper["values.expectile"], hyper["values.target_rate"])
 
         def update(values: ValueState, key: jax.Array) -> tuple[ValueState, dict[str, jax.Array]]:

@@ -37,13 +37,13 @@ class ValueHyper(struct.PyTreeNode):
 
 
 class ValueState(struct.PyTreeNode):
-    """Parameters of V, of the two heads of Q and of their target, and Adam's moments."""
+    """Parameters of V, of the two heads of Q and of their target, and Adam's state."""
 
     value: Params
     critic: Params
     target_critic: Params
-    value_moments: optax.OptState
-    critic_moments: optax.OptState
+    value_opt_state: optax.OptState
+    critic_opt_state: optax.OptState
 
 
 def expectile_loss(error: jax.Array, expectile: jax.Array | float) -> jax.Array:
@@ -98,9 +98,9 @@ class IQL:
         value_loss, grads = jax.value_and_grad(self.value_loss)(
             state.value, state.target_critic, batch, hyper.expectile
         )
-        value, value_moments = adam_step(state.value, state.value_moments, grads, hyper.learning_rate)
+        value, value_opt_state = adam_step(state.value, state.value_opt_state, grads, hyper.learning_rate)
         critic_loss, grads = jax.value_and_grad(self.critic_loss)(state.critic, value, batch)
-        critic, critic_moments = adam_step(state.critic, state.critic_moments, grads, hyper.learning_rate)
+        critic, critic_opt_state = adam_step(state.critic, state.critic_opt_state, grads, hyper.learning_rate)
         target_critic = polyak(state.target_critic, critic, hyper.target_rate)
         info = {"value_loss": value_loss, "value_q_loss": critic_loss}
-        return ValueState(value, critic, target_critic, value_moments, critic_moments), info
+        return ValueState(value, critic, target_critic, value_opt_state, critic_opt_state), info

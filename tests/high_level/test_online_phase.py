@@ -14,9 +14,9 @@ from qdos_brax.labels.offline_reward import DataReward, MinimumReward, Predicted
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
 from qdos_brax.population.members import Population
+from qdos_brax.skills.low_level import TrajectorySkills
 from qdos_brax.skills.segment_weights import UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
-from qdos_brax.skills.source import TrajectorySource
 from qdos_brax.skills.vae import SkillModel
 from tests.point import PointEnv, point_config, point_dataset
 
@@ -32,7 +32,7 @@ def plane():
     model = SkillModel(2, 2, config.skills.latent_dim, 16, 1, (32, 32), (32, 32))
     seeds = np.zeros(1, np.uint32)
     artifacts = run(SkillPhase(config, data, population, model, UniformWeights(), None), phase_keys(seeds, 0), {})
-    source = TrajectorySource(model, config.high_level.latent_map)
+    source = TrajectorySkills(model, config.high_level.latent_map)
     artifacts = run(LabelPhase(config, data, population, source), phase_keys(seeds, 1), artifacts)
     return data, normaliser, source, artifacts
 
@@ -170,7 +170,7 @@ def test_labels_are_samples_of_the_posterior():
     artifacts = {"skills": jax.tree.map(lambda x: x[None], params | {"encoder": encoder})}
     config = configs.replace(config, **{"skills.latent_box": 10.0})
     population = Population(configs.population_hyper(config))
-    phase = LabelPhase(config, data, population, TrajectorySource(model, "box"), chunk_size=1000)
+    phase = LabelPhase(config, data, population, TrajectorySkills(model, "box"), chunk_size=1000)
     assert phase.num_chunks > 1
     labels = run(phase, phase_keys(np.zeros(1, np.uint32), 0), artifacts)["labels"]
     assert labels.shape == (1, data.starts.shape[0], 2)

@@ -28,7 +28,7 @@ from qdos_brax.population.members import Population
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
 from qdos_brax.skills.latent_map import Prior, latent_map
-from qdos_brax.skills.source import ActionSource, DirectionSource, TransitionSource
+from qdos_brax.skills.low_level import DirectionSkills, PrimitiveActions, TransitionSkills
 from qdos_brax.skills.vae import Segments
 from tests.point import GOAL, STEP, TOLERANCE, PointEnv, point_config, point_dataset
 
@@ -261,7 +261,7 @@ def segments() -> tuple[Segments, jax.Array]:
 
 
 def test_an_action_is_its_own_label() -> None:
-    source, (batch, after) = ActionSource(2), segments()
+    source, (batch, after) = PrimitiveActions(2), segments()
     mean, log_std = source.posterior({}, batch, after)
     np.testing.assert_array_equal(mean + jnp.exp(log_std), batch.actions[:, 0])
     action = source.to_action({}, mean, after, 2.0)
@@ -269,7 +269,7 @@ def test_an_action_is_its_own_label() -> None:
 
 
 def test_a_direction_is_that_from_first_to_last_state() -> None:
-    source = DirectionSource(
+    source = DirectionSkills(
         2, lambda p, a, b: (b - a) / jnp.linalg.norm(b - a, axis=-1, keepdims=True), lambda p, o, z: z
     )
     batch, after = segments()
@@ -290,7 +290,7 @@ def test_a_segments_latent_is_the_mean_over_its_transitions() -> None:
         def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
             return latent
 
-    source = TransitionSource(Model(), lambda p, o, a: (o + a, jnp.full_like(a, jnp.log(0.3))), "box")
+    source = TransitionSkills(Model(), lambda p, o, a: (o + a, jnp.full_like(a, jnp.log(0.3))), "box")
     batch, after = segments()
     mean, log_std = source.posterior({}, batch, after)
     np.testing.assert_allclose(mean, (batch.observations + batch.actions).mean(axis=1), rtol=1e-5)

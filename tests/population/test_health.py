@@ -29,9 +29,9 @@ from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
 from qdos_brax.runs.metrics import read_rows
 from qdos_brax.skills.information import PhysicsRollout
+from qdos_brax.skills.low_level import TrajectorySkills
 from qdos_brax.skills.segment_weights import LoggedWeights
 from qdos_brax.skills.skill_phase import SkillPhase
-from qdos_brax.skills.source import TrajectorySource
 from qdos_brax.skills.vae import SkillModel
 from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
@@ -51,7 +51,7 @@ def phases() -> dict[str, Any]:
     population = Population(hyper_of(config))
     model = SkillModel(2, 2, 2, 8, 1, (16,), (16,))
     information = PhysicsRollout(PointEnv(), model, normaliser, config.skills.horizon, data)
-    source = TrajectorySource(model, "box")
+    source = TrajectorySkills(model, "box")
     return {
         "values": ValuePhase(config, data, population, IQL(2, 2, (16,)), updates_per_chunk=10),
         "skills": SkillPhase(config, data, population, model, LoggedWeights(), information, blocks_per_chunk=1),

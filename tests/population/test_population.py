@@ -135,7 +135,7 @@ def test_memory_is_near_what_the_compiler_says() -> None:
 
 
 def test_a_plan_gives_every_member_a_core_and_fits() -> None:
-    need, cores = memory.Estimate(shared=100, kept=10, working=20), [SimpleNamespace(platform="cpu")] * 4
+    need, cores = memory.MemoryEstimate(shared=100, kept=10, working=20), [SimpleNamespace(platform="cpu")] * 4
     plan = memory.plan(need, 9, cores, 10_000, 0)  # type: ignore[arg-type]
     assert (len(plan.devices), plan.per_program) == (4, 1) and "4 at a time, in 3 turns, over 4 devices" in plan.line
     assert len(memory.plan(need, 3, cores, 10_000, 0).devices) == 3  # type: ignore[arg-type]
@@ -147,7 +147,7 @@ def test_a_plan_gives_every_member_a_core_and_fits() -> None:
 
 
 def test_a_plan_fills_an_accelerator() -> None:
-    need, one = memory.Estimate(shared=100, kept=10, working=20), [SimpleNamespace(platform="gpu")]
+    need, one = memory.MemoryEstimate(shared=100, kept=10, working=20), [SimpleNamespace(platform="gpu")]
     assert memory.plan(need, 9, one, 10_000, 0).per_program == 9  # type: ignore[arg-type]
     assert memory.plan(need, 9, one, 10_000, 2).per_program == 2  # type: ignore[arg-type]
     assert memory.plan(need, 9, one * 3, 10_000, 0).per_program == 3  # type: ignore[arg-type]

@@ -30,10 +30,10 @@ class Killed(BaseException):
 
 
 class KilledPhase(toy.ToyPhase):
-    def chunk(self, state: toy.ToyState) -> Any:
+    def chunk(self, state: toy.ToyState, constants: None) -> Any:
         if self.name == "online" and self.chunks_run == 4:
             raise Killed
-        return super().chunk(state)
+        return super().chunk(state, constants)
 
 
 def killed_run(path: Path, observer: Any) -> None:

@@ -43,10 +43,10 @@ class StoppingPhase(toy.ToyPhase):
         super().__init__(name, num_chunks)
         self._at = at
 
-    def chunk(self, state: toy.ToyState) -> tuple[toy.ToyState, dict[str, Any]]:
+    def chunk(self, state: toy.ToyState, constants: None) -> tuple[toy.ToyState, dict[str, Any]]:
         if self.chunks_run == self._at:
             raise Stopped
-        return super().chunk(state)
+        return super().chunk(state, constants)
 
 
 def stopped_run(path: Path, phase: str, at: int, checkpoint_seconds: float = 0.0) -> None:

@@ -51,10 +51,10 @@ class ToyPhase:
         self.part = name
         self.chunks_run = 0
 
-    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> ToyState:
+    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[ToyState, None]:
         start = artifacts["policy"]["w"] if artifacts else jnp.zeros((len(MEMBERS), 3))
         params = {"w": start + jax.vmap(lambda k: jax.random.normal(k, (3,)))(key)}
-        return ToyState(
+        state = ToyState(
             keys=key,
             params=params,
             optimizer=Optimizer(jnp.zeros((), jnp.int32), ADAM.init(params)),
@@ -63,8 +63,9 @@ class ToyPhase:
             nothing=None,
             empty=jnp.zeros((0, 4)),
         )
+        return state, None
 
-    def chunk(self, state: ToyState) -> tuple[ToyState, dict[str, Any]]:
+    def chunk(self, state: ToyState, constants: None) -> tuple[ToyState, dict[str, Any]]:
         time.sleep(self.sleep)
         self.chunks_run += 1
         state, loss = _many_steps(state)

@@ -20,7 +20,7 @@ from qdos_brax.skills.vae import Posterior, Segments, SkillModel
 Box = jax.Array | float  # half the side of the box of latents, ``skills.latent_box``
 
 
-class SkillSource(Protocol):
+class LowLevelPolicy(Protocol):
     """A source of low-level behaviour. Observations are normalised; leading axes are free but for ``posterior``.
 
     Attributes:
@@ -74,7 +74,7 @@ class LatentModel(Protocol):
         ...
 
 
-class LatentSource:
+class LatentSkills:
     """A latent-variable model with a state prior, all but its posterior.
 
     Args:
@@ -114,7 +114,7 @@ class LatentSource:
         return Prior(*self._model.prior(params, observation))
 
 
-class TrajectorySource(LatentSource):
+class TrajectorySkills(LatentSkills):
     """The trajectory VAE: z says what a whole segment does.
 
     Args:
@@ -131,7 +131,7 @@ class TrajectorySource(LatentSource):
         return self._encode(params, segments)
 
 
-class TransitionSource(LatentSource):
+class TransitionSkills(LatentSkills):
     """A latent that is read off single transitions (DiveOff): a segment's is the mean over its own.
 
     Args:
@@ -156,7 +156,7 @@ class TransitionSource(LatentSource):
         return Posterior(jnp.mean(mean, axis=1), 0.5 * jnp.log(variance))
 
 
-class DirectionSource:
+class DirectionSkills:
     """Directions of travel in a representation of states: z is a unit vector, and so is every u's (HILP).
 
     Args:
@@ -201,7 +201,7 @@ class DirectionSource:
         return self._act(params, observation, latent)
 
 
-class ActionSource:
+class PrimitiveActions:
     """No skills: u is the action itself, and a segment is one step (RLPD, ExPLORe).
 
     Args:

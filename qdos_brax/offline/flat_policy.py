@@ -12,8 +12,8 @@ from qdos_brax.data.device import Normaliser
 
 
 @dataclass(frozen=True)
-class FlatPlayer:
-    """A policy that decides at every step (``qdos_brax.high_level.agent.Player`` with H = 1): a decision is an action.
+class FlatPolicy:
+    """A policy that decides at every step (``qdos_brax.high_level.agent.Policy`` with H = 1): a decision is an action.
 
     Attributes:
         normaliser: of observations.

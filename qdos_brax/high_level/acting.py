@@ -1,0 +1,142 @@
+"""Acting online: one macro step in every training environment, stored in the replay."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+from flax import struct
+
+from qdos_brax.config import Config
+from qdos_brax.data.device import Normaliser
+from qdos_brax.data.transitions import Transition
+from qdos_brax.high_level import replay as replay_buffer
+from qdos_brax.high_level.agent import Agent
+from qdos_brax.high_level.jump_start import JumpStart
+from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
+
+NEVER = -1
+"""``first_goal_step`` before the goal was reached."""
+
+
+class ActingState(struct.PyTreeNode):
+    """Hold one member's environments and what was played in them.
+
+    Attributes:
+        replay: macro transitions; observations are normalised.
+        env_state: State of the training environments, [num_envs, ...].
+        env_steps: int32, live environment steps so far, over all environments.
+        first_goal_step: int32, ``env_steps`` when the goal was first reached, in training or evaluation; ``NEVER``.
+        broken: int32, simulations that broke and were reset.
+        guided: int32[num_envs], steps that the guide still takes in each episode; None without a guide.
+    """
+
+    replay: replay_buffer.Replay
+    env_state: State
+    env_steps: jax.Array
+    first_goal_step: jax.Array
+    broken: jax.Array
+    guided: Any
+
+
+class Acting:
+    """Play macro steps with one member's agent; the first ones with random skills, or by the guide.
+
+    Args:
+        config: the run's configuration.
+        env: the task.
+        normaliser: of observations.
+        capacity: macro transitions that the replay holds.
+        guide: acts for an episode's first steps, or None; it acts step by step, so the horizon must be 1.
+
+    Raises:
+        ValueError: there is a guide and the horizon is not 1.
+    """
+
+    def __init__(
+        self, config: Config, env: Env, normaliser: Normaliser, capacity: int, guide: JumpStart | None
+    ) -> None:
+        if guide is not None and config.skills.horizon != 1:
+            raise ValueError("a guide acts step by step: the horizon must be 1")
+        self._num_envs, self._horizon = config.high_level.num_envs, config.skills.horizon
+        self._warmup, self._capacity = config.high_level.warmup_env_steps, capacity
+        self._env, self._normalise, self._guide = env, normaliser, guide
+
+    def start(self, key: jax.Array, example: Transition) -> ActingState:
+        """Return environments at their starts and an empty replay of rows like ``example``."""
+        guide = self._guide
+        return ActingState(
+            replay=replay_buffer.create(example, self._capacity),
+            env_state=jax.vmap(self._env.reset)(jax.random.split(key, self._num_envs)),
+            env_steps=jnp.zeros((), jnp.int32),
+            first_goal_step=jnp.full((), NEVER, jnp.int32),
+            broken=jnp.zeros((), jnp.int32),
+            guided=None if guide is None else guide.draw(_guide_key(key), self._num_envs),
+        )
+
+    def step(
+        self, state: ActingState, key: jax.Array, agent: Agent, guide_params: Any, hyper: dict[str, jax.Array]
+    ) -> tuple[ActingState, Transition, dict[str, jax.Array]]:
+        """Play one macro step in every environment and start ended episodes anew.
+
+        Returns:
+            The state after, the rows[num_envs] that were stored, and counts of episodes that reached the goal
+            ("reached") and that ended ("ended").
+        """
+        first_key, actor_key, reset_key = jax.random.split(key, 3)
+        observation = self._normalise(state.env_state.obs)
+        first = agent.low_level.first(agent.skills, first_key, observation, agent.box)
+        action = agent.sac.act(agent.actor, actor_key, observation)
+        action = jnp.where(state.env_steps < self._warmup, first, action)
+        if self._guide is not None:
+            guided = self._guide.sample(guide_params, _guide_key(actor_key), observation)
+            guided = agent.low_level.to_action(agent.skills, guided, observation, agent.box)
+            action = jnp.where(state.guided[:, None] > 0, guided, action)
+        latent = agent.low_level.to_latent(agent.skills, action, observation, agent.box)
+        discount = hyper["high_level.discount"]
+
+        def one(env_state: State, latent: jax.Array) -> tuple[State, MacroStep]:
+            return macro_step(self._env, lambda obs: agent.play(obs, latent), env_state, self._horizon, discount)
+
+        env_state, result = jax.vmap(one)(state.env_state, latent)
+        rows = Transition(observation, action, result.reward, result.mask, self._normalise(result.next_observation))
+        over = (env_state.done > 0.5) | ~result.finite
+        state = self._after(state, env_state, result, rows, over, reset_key)
+        return state, rows, {"reached": jnp.sum(result.success), "ended": jnp.sum(over)}
+
+    def _after(
+        self,
+        state: ActingState,
+        env_state: State,
+        result: MacroStep,
+        rows: Transition,
+        over: jax.Array,
+        key: jax.Array,
+    ) -> ActingState:
+        """Return the state with the rows stored, the steps counted, and ended episodes started anew."""
+        env_steps = state.env_steps + jnp.sum(result.steps)
+        if self._guide is not None:
+            fresh = self._guide.draw(_guide_key(key), self._num_envs)
+            state = state.replace(guided=jnp.where(over, fresh, jnp.maximum(state.guided - 1, 0)))
+        keys = jax.random.split(key, self._num_envs)
+        state = state.replace(
+            replay=replay_buffer.insert(state.replay, rows, result.finite),
+            env_state=jax.vmap(partial(reset_done, self._env))(env_state, ~result.finite, keys),
+            env_steps=env_steps,
+            broken=state.broken + jnp.sum(~result.finite).astype(jnp.int32),
+        )
+        return with_first_goal(state, result.success)
+
+
+def with_first_goal(state: ActingState, success: jax.Array) -> ActingState:
+    """Return ``state`` with the step of the first goal, if one of ``success[n]`` is above 0 for the first time."""
+    reached = jnp.any(success > 0) & (state.first_goal_step == NEVER)
+    return state.replace(first_goal_step=jnp.where(reached, state.env_steps, state.first_goal_step))
+
+
+def _guide_key(key: jax.Array) -> jax.Array:
+    """Return a key for the guide beside what ``key`` itself is used for."""
+    return jax.random.fold_in(key, 1)

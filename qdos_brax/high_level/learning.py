@@ -1,0 +1,163 @@
+"""Learning online: what one member's networks make of a macro step and of batches from replay and data."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from qdos_brax.config import Config
+from qdos_brax.data.device import DeviceData
+from qdos_brax.data.transitions import Transition, macro_transitions
+from qdos_brax.high_level import replay as replay_buffer
+from qdos_brax.high_level.sac import SAC, Reference, SACHyper, SACState
+from qdos_brax.labels.bonus import Bonus
+from qdos_brax.labels.offline_reward import OfflineReward
+from qdos_brax.skills.low_level import LowLevelPolicy
+
+
+class Learners(struct.PyTreeNode):
+    """Hold everything that learns online: SAC, the bonus for novelty, and the labeller of offline rewards."""
+
+    sac: SACState
+    bonus: Any
+    labeller: Any
+
+
+class Sources(NamedTuple):
+    """Hold what one member's learning reads and does not change.
+
+    Attributes:
+        replay: online macro transitions.
+        data: the data set.
+        skills: parameters of the low-level policy.
+        labels: float32[S, width], the high level's action of every offline segment; {} without offline rows.
+        hyper: numbers by dotted key.
+    """
+
+    replay: replay_buffer.Replay
+    data: DeviceData
+    skills: Any
+    labels: Any
+    hyper: dict[str, jax.Array]
+
+
+class Learning:
+    """Make one member's gradient steps.
+
+    As in the published code of SUPE and ExPLORe the bonus learns from every macro step once, when it was just played,
+    and the labeller as often as the critics do.
+
+    Args:
+        config: the run's configuration.
+        sac: the high level.
+        low_level: the frozen low-level policy.
+        labeller: gives offline rows their reward and mask.
+        bonus: for novelty.
+    """
+
+    def __init__(
+        self, config: Config, sac: SAC, low_level: LowLevelPolicy, labeller: OfflineReward, bonus: Bonus
+    ) -> None:
+        self._high, self._labels, self._horizon = config.high_level, config.labels, config.skills.horizon
+        self._sac, self._low_level, self._labeller, self._bonus = sac, low_level, labeller, bonus
+        self._offline = round(self._high.batch_size * self._high.offline_fraction)
+
+    def init(self, sac_key: jax.Array, bonus_key: jax.Array, labeller_key: jax.Array, hyper: Any) -> Learners:
+        """Return fresh learners."""
+        return Learners(
+            sac=self._sac.init(sac_key, hyper["high_level.init_temperature"]),
+            bonus=self._bonus.init(bonus_key),
+            labeller=self._labeller.init(labeller_key),
+        )
+
+    def step(
+        self, learners: Learners, given: tuple[jax.Array, Transition], env_steps: jax.Array, sources: Sources
+    ) -> tuple[Learners, dict[str, jax.Array]]:
+        """Learn from one macro step: the labels' steps, ``utd`` of the critics, one of actor and temperature.
+
+        Args:
+            learners: before.
+            given: a key, and the macro step that was just played (no leading axis).
+            env_steps: environment steps so far; the labels wait for ``labels.start_env_steps``.
+            sources: what batches are drawn from.
+
+        Returns:
+            The learners after, and scalars for metrics.csv.
+        """
+        (key, newest), hyper = given, sources.hyper
+        active = env_steps >= self._labels.start_env_steps
+        label_key, actor_key, critic_key = jax.random.split(key, 3)
+        bonus = self._bonus.learn(learners.bonus, newest.observation[None], newest.action[None], hyper, active)
+        learners = learners.replace(bonus=bonus)
+        learners = self._learn_rewards(learners, label_key, active, sources)
+        sac, info = self._learn_sac(learners, critic_key, actor_key, sources)
+        earned = self._bonus.of(learners.bonus, newest.observation, newest.action, hyper)
+        return learners.replace(sac=sac), info | {"bonus": jnp.mean(earned)}
+
+    def sample(self, learners: Learners, key: jax.Array, sources: Sources) -> Transition:
+        """Return a batch, offline rows first, with the bonus for novelty added to rewards."""
+        online_key, offline_key = jax.random.split(key)
+        rows = replay_buffer.sample(sources.replay, online_key, self._high.batch_size - self._offline)
+        if self._offline:
+            offline = self._sample_offline(learners, offline_key, sources)
+            rows = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), offline, rows)
+        bonus = self._bonus.of(learners.bonus, rows.observation, rows.action, sources.hyper)
+        if self._labels.bonus_rows == "online":
+            bonus = jnp.where(jnp.arange(len(rows.reward)) < self._offline, 0.0, bonus)
+        return rows._replace(reward=rows.reward + bonus)
+
+    def _sample_offline(self, learners: Learners, key: jax.Array, sources: Sources) -> Transition:
+        """Return labelled segments, with the reward and mask that the labeller gives them."""
+        data, discount = sources.data, sources.hyper["high_level.discount"]
+        index = jax.random.randint(key, (self._offline,), 0, data.starts.shape[0])
+        rows = macro_transitions(data, data.starts[index], self._horizon, discount, sources.labels[index])
+        reward, mask = self._labeller.label(learners.labeller, rows, discount)
+        return rows._replace(reward=reward, mask=mask)
+
+    def _learn_rewards(self, learners: Learners, key: jax.Array, active: jax.Array, sources: Sources) -> Learners:
+        """Make as many steps of the labeller as of the critics, on as many online rows (SUPE's, ExPLORe's code)."""
+        rate, online = sources.hyper["labels.reward_learning_rate"], self._high.batch_size - self._offline
+
+        def step(labeller: Any, key: jax.Array) -> tuple[Any, None]:
+            rows = replay_buffer.sample(sources.replay, key, online)
+            return self._labeller.learn(labeller, rows, rate, active), None
+
+        labeller, _ = jax.lax.scan(step, learners.labeller, jax.random.split(key, self._high.utd))
+        return learners.replace(labeller=labeller)
+
+    def _learn_sac(
+        self, learners: Learners, critic_key: jax.Array, actor_key: jax.Array, sources: Sources
+    ) -> tuple[SACState, dict[str, jax.Array]]:
+        """Make ``utd`` critic steps, then one of actor and temperature."""
+        hyper = sources.hyper
+        target_entropy, reference = self._regulariser(sources.skills, hyper)
+        sac_hyper = SACHyper(
+            learning_rate=hyper["high_level.learning_rate"],
+            discount=hyper["high_level.discount"],
+            target_rate=hyper["high_level.target_rate"],
+            target_entropy=target_entropy,
+        )
+        sample = partial(self.sample, learners, sources=sources)
+
+        def critic_step(sac: SACState, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
+            batch_key, update_key = jax.random.split(key)
+            return self._sac.update_critic(sac, sample(batch_key), update_key, sac_hyper, reference)
+
+        sac, critic_info = jax.lax.scan(critic_step, learners.sac, jax.random.split(critic_key, self._high.utd))
+        batch_key, update_key = jax.random.split(actor_key)
+        sac, actor_info = self._sac.update_actor(sac, sample(batch_key).observation, update_key, sac_hyper, reference)
+        return sac, jax.tree.map(jnp.mean, critic_info) | actor_info
+
+    def _regulariser(self, skills: Any, hyper: dict[str, jax.Array]) -> tuple[jax.Array, Reference | None]:
+        """Return the entropy that the temperature aims at, and the density it is relative to."""
+        if self._high.regulariser == "entropy":
+            return -hyper["high_level.target_entropy_scale"] * self._sac.action_dim, None
+
+        def log_prior(observation: jax.Array, action: jax.Array) -> jax.Array:
+            return self._low_level.log_prior(skills, action, observation, hyper["skills.latent_box"])
+
+        return -hyper["high_level.target_divergence"], log_prior
