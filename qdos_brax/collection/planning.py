@@ -41,7 +41,7 @@ class Planner:
     def __init__(self, env: TaskEnv, recipe: CollectionRecipe, has_dribbler: bool) -> None:
         self.recipe, self.has_dribbler = recipe, has_dribbler
         self.navigator = Navigator(env.layout)
-        self._action_size = env.engine.nu
+        self._action_size = env.action_size
         rate = steps_per_second(env)
         self._check_every, self._escape_steps = round(CHECK_SECONDS * rate), round(ESCAPE_SECONDS * rate)
         self._wander_steps, self._patience = round(WANDER_SECONDS * rate), round(PATIENCE_SECONDS * rate)

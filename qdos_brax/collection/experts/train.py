@@ -22,9 +22,9 @@ import numpy as np
 
 from qdos_brax.collection.experts.tasks import TASKS
 from qdos_brax.collection.experts.trainer import Sizes, Trainer
-from qdos_brax.collection.experts.weights import Actor, write_actor, write_arrays
+from qdos_brax.collection.experts.weights import Actor, write_actor
 from qdos_brax.errors import UserError
-from qdos_brax.files import write_text
+from qdos_brax.files import write_arrays, write_text
 from qdos_brax.high_level.sac import SACState
 from qdos_brax.runs.checkpoint import CheckpointStore, Position, choose
 
@@ -112,7 +112,7 @@ def _csv_text(rows: list[dict[str, float]]) -> str:
 
 
 def write_learner(path: Path, sac: SACState) -> None:
-    """Write networks, targets, temperature and Adam's state as plain arrays; errors as ``weights.write_arrays``."""
+    """Write networks, targets, temperature and Adam's state as plain arrays; errors as ``files.write_arrays``."""
     leaves = jax.tree_util.tree_flatten_with_path(sac)[0]
     write_arrays(path, {jax.tree_util.keystr(where): np.asarray(leaf) for where, leaf in leaves})
 

@@ -15,7 +15,7 @@ import numpy as np
 from flax import traverse_util
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import replacing
+from qdos_brax.files import write_arrays
 from qdos_brax.nn.networks import DiagonalGaussian
 
 
@@ -46,20 +46,10 @@ def shipped(name: str) -> Path:
 
 
 def write_actor(path: Path, actor: Actor) -> None:
-    """Write the weights as plain arrays with a JSON header; errors as ``write_arrays``."""
+    """Write the weights as plain arrays with a JSON header; errors as ``files.write_arrays``."""
     flat = {"/".join(k): np.asarray(v) for k, v in traverse_util.flatten_dict(actor.params).items()}
     header = {**actor.header, "hidden": list(actor.hidden)}
     write_arrays(path, {**flat, "header": np.frombuffer(json.dumps(header).encode(), np.uint8)})
-
-
-def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write an .npz atomically.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    with replacing(path) as partial:
-        np.savez_compressed(partial, allow_pickle=False, **arrays)
 
 
 def read_actor(path: Path) -> Actor:
