@@ -1,8 +1,8 @@
-"""What collecting costs: ``python benchmarks/collection.py [--tasks TASK ..] [--out results/collection.json]``.
+"""Measure the cost of collecting: ``python benchmarks/collection.py [--tasks TASK ..] [--out FILE]``.
 
-Collected steps per second (experts, steering, observation, transfer to the host: everything but writing the file)
-against the bare engine's: the very same starts and actions, stepped in jit with nothing around it. The two take turns,
-chunk by chunk, so that a machine whose speed varies slows both down; the share is the median over the turns.
+Compare collected steps per second (experts, steering, observation, transfer to the host: everything but writing the
+file) with the bare engine: the same starts and actions, stepped in jit with nothing around it. The two take turns,
+chunk by chunk, so that a machine whose speed varies slows down both; the share is the median over the turns.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 
 import envs
-from qdos_brax.collection.bodies import conduct_of
-from qdos_brax.collection.collect import CHUNK_STEPS, Collector
+from qdos_brax.collection.collector import CHUNK_STEPS, Collector
+from qdos_brax.collection.profiles import profile_of
 from qdos_brax.collection.recipes import degraded, episode_kinds
 from qdos_brax.files import write_text
 
@@ -28,13 +28,12 @@ TASKS = ("antmaze-large", "antsoccer-arena", "humanoidmaze-medium")
 
 
 def measure(task: str, num_envs: int, turns: int) -> dict[str, Any]:
-    """Steps per second of both, and the share, over ``turns`` chunks of CHUNK_STEPS steps of every environment."""
+    """Return steps per second of both, and the share, over ``turns`` chunks of CHUNK_STEPS steps per environment."""
     env = envs.make(task, physics="mujoco")
-    body = conduct_of(env)
-    recipe = degraded(0.5, body)
-    collector = Collector(env, body.expert(), recipe)
+    recipe = degraded(0.5, profile_of(env))
+    collector = Collector(env, recipe)
     kinds = jnp.asarray(episode_kinds(recipe.mix, num_envs, seed=0))
-    lanes = collector._reset(jax.random.split(jax.random.key(0), num_envs))
+    states = collector.reset(jax.random.split(jax.random.key(0), num_envs))
 
     @partial(jax.jit, donate_argnums=0)
     def bare(pipeline: Any, actions: jax.Array) -> Any:
@@ -46,9 +45,9 @@ def measure(task: str, num_envs: int, turns: int) -> dict[str, Any]:
     collecting, stepping = [], []
     for turn in range(turns + 1):  # the first compiles
         keys = jax.random.split(jax.random.fold_in(jax.random.key(1), turn), num_envs)
-        start = jax.tree.map(jnp.copy, lanes.pipeline)
+        start = jax.tree.map(jnp.copy, states.pipeline)
         began = time.perf_counter()
-        lanes, rows = collector._chunk(lanes, kinds, keys)
+        states, rows = collector.chunk(states, kinds, keys)
         rows = jax.device_get(rows)
         halfway = time.perf_counter()
         jax.block_until_ready(bare(start, rows.action))
@@ -65,12 +64,12 @@ def measure(task: str, num_envs: int, turns: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", default=list(TASKS))
-    parser.add_argument("--num-envs", type=int, default=64)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), help=f"tasks (default {' '.join(TASKS)})")
+    parser.add_argument("--num-envs", type=int, default=64, help="environments stepped at once (default 64)")
     parser.add_argument("--turns", type=int, default=10, help="chunks measured (default 10)")
-    parser.add_argument("--out", type=Path, help="JSON file")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     rows = []

@@ -1,14 +1,15 @@
-"""100,000 environment steps of every task: ``python benchmarks/long_rollouts.py [--out results/long_rollouts.json]``.
+"""Make 100,000 steps of every task: ``python benchmarks/long_rollouts.py [--out results/long_rollouts.json]``.
 
 A hundred environments make a thousand control steps each, with resets in between. Half of the bodies walk straight on,
-into the walls (a humanoid from its feet, and until it falls); the others act at random. Watched are, over all states,
+into the walls (a humanoid starts standing and walks until it falls); the others act at random. Measured over all
+states:
 
 - how many were not finite,
 - height (m) and speed (m/s) of the walking body, and of the ball,
-- mechanical energy (J), kinetic and potential as MuJoCo C reckons them, the floor being the zero; and the most that it
-  rose in one control step, next to the most that the motors could have put in then: torque times the joints' speed (the
-  faster of before and after), all joints together. A body at rest against a wall loses energy ever more slowly, down to
-  less than the last bit of its float32 coordinates: a rise counts where it is beyond that too,
+- mechanical energy (J), kinetic and potential as computed by MuJoCo C, zero at the floor; and its largest rise in one
+  control step, next to the most that the motors could have added in that step: torque times the joints' speed (the
+  faster of before and after), summed over joints. A body at rest against a wall loses energy ever more slowly, down to
+  less than the last bit of its float32 coordinates: a rise counts only if it also exceeds that,
 - how often the middle of a body was inside a wall.
 """
 
@@ -27,8 +28,9 @@ import numpy as np
 
 import envs
 from envs.physics.walls import cells_in_reach
-from qdos_brax.collection.bodies import conduct_of
 from qdos_brax.collection.experts import policies
+from qdos_brax.collection.experts.views import direction_of
+from qdos_brax.collection.profiles import profile_of
 from qdos_brax.files import write_text
 
 STEPS = 100_000
@@ -36,20 +38,20 @@ NUM_ENVS = 100
 
 
 def rollouts(env: Any, seed: int = 0) -> dict[str, np.ndarray]:
-    """What ``STEPS`` steps of the task went through: qpos[T, N, nq], qvel[T, N, nv], and done and nan[T, N].
+    """Make ``STEPS`` steps of the task in N environments.
 
     Args:
-        env: with ``AutoReset`` around it; the state after a step that is done is the next episode's first.
-        seed: of starts, directions and actions.
+        env: the task wrapped by ``AutoReset``; the state after a step that is done is the next episode's first.
+        seed: seed of starts, directions and actions.
 
     Returns:
-        Also "start", the (qpos, qvel) before the first step.
+        qpos[T + 1, N, nq] and qvel[T + 1, N, nv], starting before the first step, and bool[T, N] done and nan.
     """
     reset_key, angle_key, action_key = jax.random.split(jax.random.key(seed), 3)
-    conduct, half = conduct_of(env), NUM_ENVS // 2
-    walker = policies.walker_of(conduct.expert())
+    profile, half = profile_of(env), NUM_ENVS // 2
+    walker = policies.walker_of(profile.expert())
     angle = jax.random.uniform(angle_key, (NUM_ENVS,), minval=-np.pi, maxval=np.pi)
-    direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    direction = direction_of(angle)
 
     def body(state: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         action = jax.random.uniform(key, (NUM_ENVS, env.action_size), minval=-1)
@@ -59,13 +61,13 @@ def rollouts(env: Any, seed: int = 0) -> dict[str, np.ndarray]:
         after = state.pipeline_state
         return state, {"qpos": after.qpos, "qvel": after.qvel, "done": state.done > 0, "nan": state.metrics["nan"] > 0}
 
-    def on_its_feet(key: jax.Array, ahead: jax.Array) -> Any:
-        return env.reset_to(*conduct.start(env, ahead, key), key=key)
+    def standing(key: jax.Array, ahead: jax.Array) -> Any:
+        return env.reset_to(*profile.start(env, ahead, key), key=key)
 
     reset_keys = jax.random.split(reset_key, NUM_ENVS)
     state = jax.jit(jax.vmap(env.reset))(reset_keys)
-    if conduct.is_down is not None:  # the task drops it, and its walker cannot get up
-        walkers = jax.jit(jax.vmap(on_its_feet))(reset_keys[:half], direction[:half])
+    if profile.has_fallen is not None:  # the task's reset drops the body, and its walker cannot get up
+        walkers = jax.jit(jax.vmap(standing))(reset_keys[:half], direction[:half])
         state = jax.tree.map(lambda walking, other: jnp.concatenate([walking, other[half:]]), walkers, state)
     keys = jax.random.split(action_key, STEPS // NUM_ENVS)
     _, seen = jax.jit(lambda s, k: jax.lax.scan(body, s, k))(state, keys)
@@ -76,7 +78,7 @@ def rollouts(env: Any, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def energy(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """float64[...], kinetic and potential energy (J) of states (qpos[..., nq], qvel[..., nv])."""
+    """Return float64[...], kinetic plus potential energy (J), of states (qpos[..., nq], qvel[..., nv])."""
     data = mujoco.MjData(model)
     found = []
     for position, velocity in zip(qpos.reshape(-1, model.nq), qvel.reshape(-1, model.nv), strict=True):
@@ -91,7 +93,7 @@ def energy(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndar
 
 
 def motor_work(model: mujoco.MjModel, qvel: np.ndarray, seconds: float) -> np.ndarray:
-    """float64[T, ...], the most that the motors can do (J) between ``qvel[T + 1, ..., nv]`` and the next, see above."""
+    """Return float64[T, ...], the most work (J) of the motors between each of ``qvel[T + 1, ..., nv]`` and the next."""
     joints = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     torque = np.abs(model.actuator_gear[:, 0] * model.actuator_ctrlrange[:, 1])
     rate = np.abs(qvel[..., joints])
@@ -99,11 +101,11 @@ def motor_work(model: mujoco.MjModel, qvel: np.ndarray, seconds: float) -> np.nd
 
 
 def rounding(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """float64[...], by how much ``energy`` (J) may be off because states are seen in float32.
+    """Return float64[...], the error of ``energy`` (J) that float32 states can cause.
 
-    Every number may be half a unit in its last place away from the simulator's. To first order that is weight times the
-    shift in height of the centre of mass, and momentum times the shift in velocity. How the mass matrix changes with
-    qpos is left out: it goes with the square of the speed, which matters to no body at rest.
+    Every number may be half a unit in its last place away from the simulator's. To first order the error is weight
+    times the shift in height of the centre of mass, plus momentum times the shift in velocity. The change of the mass
+    matrix with qpos is left out: it scales with the square of the speed, which is negligible for a body at rest.
     """
     data = mujoco.MjData(model)
     jacobian, momentum = np.zeros((3, model.nv)), np.zeros(model.nv)
@@ -122,26 +124,26 @@ def rounding(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.nd
 
 
 def _shifts(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """float64[..., nv], the most that rounding ``qpos[..., nq]`` to float32 moves each degree of freedom."""
+    """Return float64[..., nv], the most that rounding ``qpos[..., nq]`` to float32 moves each degree of freedom."""
     units = _half_units(qpos)
     moved = np.empty((*qpos.shape[:-1], model.nv))
     for kind, place, first in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
         moved[..., first] = units[..., place]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             moved[..., first : first + 3] = units[..., place : place + 3]
-            # a unit quaternion turns its body by twice the way that it goes itself
+            # the body turns by twice the distance that its unit quaternion moves
             turn = 2 * np.linalg.norm(units[..., place + 3 : place + 7], axis=-1, keepdims=True)
             moved[..., first + 3 : first + 6] = turn
     return moved
 
 
 def _half_units(values: np.ndarray) -> np.ndarray:
-    """float64[...], half a unit in the last place of each of ``values`` in float32."""
+    """Return float64[...], half a unit in the last place of each of ``values`` in float32."""
     return np.spacing(np.abs(values).astype(np.float32)).astype(np.float64) / 2
 
 
 def watch(name: str, physics: str) -> dict[str, Any]:
-    """The figures of one task on one engine."""
+    """Measure one task on one engine; return the numbers that the JSON file holds."""
     began = time.perf_counter()
     env = envs.AutoReset(envs.make(name, physics=physics))
     model = env.whole_model()
@@ -173,18 +175,18 @@ def watch(name: str, physics: str) -> dict[str, Any]:
 
 
 def span(values: np.ndarray) -> dict[str, float]:
-    """Least, median and most."""
+    """Return the least, the median and the largest value, to four digits."""
     least, median, most = (float(f"{value:.4g}") for value in np.quantile(values, [0, 0.5, 1]))
     return {"least": least, "median": median, "most": most}
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = list(dict.fromkeys(spec.name for spec in envs.list_tasks()))
-    parser.add_argument("--tasks", nargs="+", default=names)
-    parser.add_argument("--physics", nargs="+", default=["mujoco", "mjx"])
-    parser.add_argument("--out", type=Path, help="JSON file; what it holds of other tasks and engines stays")
+    parser.add_argument("--tasks", nargs="+", default=names, help="tasks (default all)")
+    parser.add_argument("--physics", nargs="+", default=["mujoco", "mjx"], help="engines (default mujoco mjx)")
+    parser.add_argument("--out", type=Path, help="JSON file to update; entries of other tasks and engines are kept")
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     found = json.loads(args.out.read_text()) if args.out and args.out.exists() else {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
 from qdos_brax.errors import UserError
-from qdos_brax.files import replacing
+from qdos_brax.files import write_arrays
 from qdos_brax.methods.build import make_low_level
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.skills.vae import Segments
@@ -78,10 +77,7 @@ def look_inside(run: Path) -> None:
     for member in members:
         found = _weights(trained, member, sample) | latents.of(member) | _episode(trained, player, member)
         arrays |= {f"{member}/{name}": array for name, array in found.items()}
-    content = io.BytesIO()
-    np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
-    with replacing(RunFolder.open(run).inside) as partial:
-        partial.write_bytes(content.getvalue())
+    write_arrays(RunFolder.open(run).inside, arrays)
 
 
 class _Sample(NamedTuple):

@@ -1,9 +1,10 @@
-"""Default sets: collected once per machine, kept in a folder, shared by all tasks of a maze."""
+"""Default data sets: collected once per machine, kept in a folder, shared by all tasks of a maze."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
@@ -12,8 +13,11 @@ from tqdm import tqdm
 
 import qdos_brax
 from envs.task import TaskEnv
-from qdos_brax.collection import bodies, collect, recipes
+from qdos_brax.collection import recipes
+from qdos_brax.collection.collect import COLLECTION_VERSION, check_size, collect
+from qdos_brax.collection.collector import Collector
 from qdos_brax.collection.experts import policies
+from qdos_brax.collection.profiles import profile_of
 from qdos_brax.data import formats
 from qdos_brax.data.cache import folder, locked
 from qdos_brax.data.quality import QUALITY
@@ -22,76 +26,77 @@ from qdos_brax.data.quality import QUALITY
 def default_dataset(
     env: TaskEnv, transitions: int, degraded_share: float, noise: float, seed: int, num_envs: int = 64
 ) -> Path:
-    """The path of the set with these parameters; collects it if it is not there.
+    """Return the path of the set with these parameters; collect it if it does not exist.
 
-    Two processes that ask at once collect it once: the second waits. What lies under the name is always whole.
+    If two processes ask at once, one collects and the other waits. A file under this name is always complete.
 
     Args:
-        env: the task; the set is that of its maze, for the rows are labelled when they are read.
-        transitions: rows.
+        env: the task; the set serves its whole maze, since rows are labelled when they are read.
+        transitions: number of rows.
         degraded_share: share of degraded episodes.
         noise: standard deviation of the action noise of the others.
-        seed: of the collection.
+        seed: seed of the collection.
         num_envs: environments stepped at once.
 
     Raises:
         UserError: a parameter is out of range, no expert is shipped for the body, or the folder cannot be written.
     """
-    body = bodies.conduct_of(env)
-    policy = body.expert()
-    recipe = recipes.degraded(degraded_share, body, noise)
+    profile = profile_of(env)
+    expert = profile.expert()
+    recipe = recipes.degraded(degraded_share, profile, noise)
     parameters = f"n{transitions}-bad{degraded_share:g}-noise{noise:g}-seed{seed}-envs{num_envs}"
-    version = f"{env.backend}-v{collect.RECIPE}-{policies.digest(policy)}"
+    version = f"{env.backend}-v{COLLECTION_VERSION}-{policies.digest(expert)}"
     path = folder() / f"{env.spec.name}-{parameters}-{version}.hdf5"
     if path.exists():
         return path
     with locked(path):
         if not path.exists():  # another process may have made it while this one waited
             print(f"no data for {env.spec.name} yet: collecting {transitions:,} steps into {path}", flush=True)
-            make_file(path, env, transitions, recipe, seed, num_envs, policy)
+            make_file(path, Collector(env, recipe, expert), transitions, seed, num_envs)
     return path
 
 
-def make_file(
-    path: Path,
-    env: TaskEnv,
-    transitions: int,
-    recipe: recipes.Recipe,
-    seed: int,
-    num_envs: int,
-    policy: policies.Policy | None = None,
-) -> None:
-    """Collects a set (see ``collect.collect``) with a progress bar; writes it to ``path`` with where it came from."""
-    policy = policy or bodies.conduct_of(env).expert()
-    collect.check_size(transitions, seed, num_envs)  # before there is a bar
+def make_file(path: Path, collector: Collector, transitions: int, seed: int, num_envs: int) -> None:
+    """Collect a set with a progress bar and write it to ``path``, with its origin as attributes.
+
+    Args:
+        path: the ``.hdf5`` file.
+        collector, transitions, seed, num_envs: see ``collect.collect``.
+
+    Raises:
+        UserError: an argument is out of range, or the file cannot be written.
+    """
+    check_size(transitions, seed, num_envs)  # before the bar appears
     with tqdm(total=transitions, unit="steps", unit_scale=True, desc="collect", file=sys.stderr) as bar:
 
         def report(done: int, total: int) -> None:
             bar.update(done - bar.n)
 
-        rows = collect.collect(env, transitions, recipe, seed, num_envs, report, policy)
-    counts = np.bincount(rows["infos/quality"], minlength=len(QUALITY))
+        rows = collect(collector, transitions, seed, num_envs, report)
+    formats.write_hdf5(path, rows, _attributes(collector, rows) | {"seed": seed, "num_envs": num_envs})
+
+
+def _attributes(collector: Collector, rows: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return the file's attributes: how the rows were collected, and what they contain."""
+    env, recipe = collector.env, collector.recipe
+    counts = np.bincount(rows["infos/quality"], minlength=len(QUALITY)) / len(rows["infos/quality"])
     attributes = {
         "env": env.spec.full_name,
-        "seed": seed,
         "recipe": recipe.name,
         "mix": recipes.mix_text(recipe.mix),
         "noise": recipe.noise,
         "heavy_noise": recipe.heavy_noise,
-        "num_envs": num_envs,
         "physics": env.backend,
-        "expert": policies.digest(policy),
-        "composition": " ".join(f"{name}={counts[code] / transitions:.3f}" for name, code in QUALITY.items()),
-        "version": collect.RECIPE,
+        "expert": policies.digest(collector.expert),
+        "composition": " ".join(f"{name}={counts[code]:.3f}" for name, code in QUALITY.items()),
+        "version": COLLECTION_VERSION,
         "packages": f"qdos-brax {qdos_brax.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}",
     }
-    if "infos/fell" in rows:
-        attributes["falls"] = _falls(rows)
-    formats.write_hdf5(path, rows, attributes)
+    return attributes | ({"falls": _falls(rows)} if "infos/fell" in rows else {})
 
 
 def _falls(rows: dict[str, np.ndarray]) -> str:
-    """As "navigate=7/40 noisy=31/35": episodes of each behaviour that a fall ended, of how many."""
+    """Return "navigate=7/40 noisy=31/35": for each behaviour, how many of its episodes ended by a fall."""
     kinds, fell = rows["infos/quality"][rows["timeouts"]], rows["infos/fell"][rows["timeouts"]]
     counts = {name: kinds == code for name, code in QUALITY.items()}
     return " ".join(f"{name}={(fell & chosen).sum()}/{chosen.sum()}" for name, chosen in counts.items() if chosen.any())

@@ -1,7 +1,7 @@
-"""What is collected: OGBench's recipes for mazes and soccer, and mixtures of good and degraded behaviour.
+"""Recipes for collecting data: OGBench's for mazes and soccer, and mixtures of good and degraded behaviour.
 
-Behaviours, one per episode: ``expert`` goes to goals (soccer: brings the ball there), ``noisy`` does under heavy action
-noise, ``wander`` walks in random directions, ``fail`` turns round half-way and undoes what it did.
+Every episode follows one behaviour: ``expert`` goes to goals (soccer: brings the ball there), ``noisy`` does so under
+heavy action noise, ``wander`` walks in random directions, ``fail`` turns round half-way and goes back.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from qdos_brax.collection.bodies import Conduct
+from qdos_brax.collection.profiles import CollectionProfile
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
 
@@ -20,22 +20,23 @@ BEHAVIOURS = {"expert": QUALITY["navigate"], **{name: code for name, code in QUA
 
 NAMES = ("navigate", "stitch", "explore", "mixed")
 
-NOISE = 0.2  # standard deviation on actions, as OGBench's: the experts do their work under it
-EXPLORE_STEPS = 500  # of an episode of explore
+NOISE = 0.2  # standard deviation of the action noise, as in OGBench; the experts succeed under it
+EXPLORE_STEPS = 500  # control steps of an episode of explore
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """A kind of data.
+class CollectionRecipe:
+    """Describe a kind of data.
 
     Attributes:
         name: "navigate", "stitch", "explore" or "mixed".
         mix: share of the episodes of each behaviour; sums to 1.
-        noise: standard deviation of the Gaussian noise on actions, but for noisy episodes.
-        heavy_noise: that of noisy episodes.
-        episode_steps: length of an episode; None takes the task's cap.
-        goal_cells: goals are this many cells away and kept to the end; None draws them anywhere, again on arrival.
-        heading_seconds: time between two draws of a wanderer's direction; None draws at random times.
+        noise: standard deviation of the Gaussian action noise, except in noisy episodes.
+        heavy_noise: standard deviation in noisy episodes.
+        episode_steps: length of an episode in control steps; None takes the task's cap.
+        goal_cells: a goal lies this many cells away and is kept to the end; None draws goals anywhere, a new one on
+            arrival.
+        heading_seconds: time between two draws of a wandering body's direction; None draws at random times.
     """
 
     name: str
@@ -47,52 +48,62 @@ class Recipe:
     heading_seconds: float | None = None
 
 
-def mixed(mix: Mapping[str, float], body: Conduct, noise: float = NOISE) -> Recipe:
-    """A mixture of behaviours that go to goals anywhere.
+def mixed(mix: Mapping[str, float], body: CollectionProfile, noise: float = NOISE) -> CollectionRecipe:
+    """Return the recipe for a mixture of behaviours, with goals anywhere.
 
     Raises:
         UserError: shares are negative or do not sum to 1, a behaviour is unknown, or the noise is negative.
     """
     for name, share in mix.items():
         if name not in BEHAVIOURS:
-            raise UserError(f"there is no behaviour {name!r}; a mix names {', '.join(BEHAVIOURS)}")
+            raise UserError(f"unknown behaviour {name!r} in the mix; choose from {', '.join(BEHAVIOURS)}")
         if not 0.0 <= share <= 1.0:
             raise UserError(f"the share of {name} must lie in [0, 1], got {share}")
     if abs(sum(mix.values()) - 1.0) > 1e-6:
         raise UserError(f"the shares of a mix must sum to 1, these sum to {sum(mix.values()):g}: {mix_text(mix)}")
     if not noise >= 0.0:
         raise UserError(f"the action noise must be 0 or more, got {noise}")
-    return Recipe("mixed", mix, noise, body.heavy_noise)
+    return CollectionRecipe("mixed", mix, noise, body.heavy_noise)
 
 
-def degraded(share: float, body: Conduct, noise: float = NOISE) -> Recipe:
-    """The default sets: a share of the episodes is degraded, each bad behaviour in equal parts; errors as above."""
+def degraded(share: float, body: CollectionProfile, noise: float = NOISE) -> CollectionRecipe:
+    """Return the default sets' recipe: ``share`` of the episodes is degraded, each bad behaviour in equal parts.
+
+    Raises:
+        UserError: the share is not in [0, 1], or the noise is negative.
+    """
     if not 0.0 <= share <= 1.0:
         raise UserError(f"the degraded share must lie in [0, 1], got {share}")
     others = [name for name in BEHAVIOURS if name != "expert"]
     return mixed({"expert": 1.0 - share, **dict.fromkeys(others, share / len(others))}, body, noise)
 
 
-def named(name: str, body: Conduct, noise: float | None = None) -> Recipe:
-    """OGBench's "navigate", "stitch" or "explore"; None takes its noise, of ``explore`` the body's heavy one.
+def named(name: str, body: CollectionProfile, noise: float | None = None) -> CollectionRecipe:
+    """Return OGBench's recipe "navigate", "stitch" or "explore".
 
-    Errors as ``mixed``.
+    Args:
+        name: which one.
+        body: the body's profile.
+        noise: standard deviation of the action noise; None takes OGBench's, for ``explore`` the body's heavy noise.
+
+    Raises:
+        UserError: the noise is negative.
     """
     to_goals = mixed({"expert": 1.0}, body, NOISE if noise is None else noise)
-    about = mixed({"wander": 1.0}, body, body.heavy_noise if noise is None else noise)
+    wandering = mixed({"wander": 1.0}, body, body.heavy_noise if noise is None else noise)
     recipes = {
         "navigate": to_goals,
         "stitch": replace(to_goals, episode_steps=body.stitch_steps, goal_cells=4),
-        "explore": replace(about, episode_steps=EXPLORE_STEPS, heading_seconds=1.0),
+        "explore": replace(wandering, episode_steps=EXPLORE_STEPS, heading_seconds=1.0),
     }
     return replace(recipes[name], name=name)
 
 
 def parse_mix(text: str) -> dict[str, float]:
-    """ "expert=0.3,noisy=0.7" as a mapping.
+    """Parse "expert=0.3,noisy=0.7" into a mapping.
 
     Raises:
-        UserError: it does not read so.
+        UserError: the text has another form, or names a behaviour twice.
     """
     mix: dict[str, float] = {}
     for part in text.split(","):
@@ -100,17 +111,20 @@ def parse_mix(text: str) -> dict[str, float]:
         try:
             value = float(share)
         except ValueError:
-            raise UserError(f"--mix {text}: write it as expert=0.5,noisy=0.5; {part!r} is no share") from None
+            raise UserError(
+                f"--mix {text}: {part!r} is not of the form NAME=SHARE; write, for example, expert=0.5,noisy=0.5"
+            ) from None
         if name.strip() in mix:
-            raise UserError(f"--mix {text}: {name.strip()} is there twice")
+            raise UserError(f"--mix {text}: {name.strip()} appears twice; give each behaviour one share")
         mix[name.strip()] = value
     return mix
 
 
 def episode_kinds(mix: Mapping[str, float], episodes: int, seed: int) -> np.ndarray:
-    """int8[episodes], a behaviour's code per episode in random order.
+    """Return int8[episodes], the code of each episode's behaviour, in random order.
 
-    The number of episodes that are not the expert's is the nearest whole one; the largest remainders share it out.
+    The number of degraded episodes is the nearest integer to their share; largest remainders divide it among the
+    behaviours.
     """
     shares = {BEHAVIOURS[name]: share for name, share in mix.items() if name != "expert" and share > 0.0}
     total = sum(shares.values())
@@ -125,5 +139,5 @@ def episode_kinds(mix: Mapping[str, float], episodes: int, seed: int) -> np.ndar
 
 
 def mix_text(mix: Mapping[str, float]) -> str:
-    """What ``parse_mix`` reads."""
+    """Format a mix as text that ``parse_mix`` reads."""
     return ",".join(f"{name}={share}" for name, share in mix.items())

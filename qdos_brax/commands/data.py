@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 import envs
-from qdos_brax.collection import bodies, recipes
+from qdos_brax.collection import recipes
+from qdos_brax.collection.collector import Collector
 from qdos_brax.collection.default_set import make_file
+from qdos_brax.collection.profiles import profile_of
 from qdos_brax.data import checks, download, formats, sources
 from qdos_brax.data.dataset import episode_bounds
 from qdos_brax.data.labelling import label
@@ -85,13 +87,13 @@ def _make(args: argparse.Namespace) -> int:
     if path.suffix not in (".hdf5", ".h5"):
         raise UserError(f"--out {args.out}: data is written as .hdf5; give the file that ending")
     env = _env(args.task, args.physics)
-    make_file(path, env, args.transitions, _recipe(args, env), args.seed, args.num_envs)
+    make_file(path, Collector(env, _recipe(args, env)), args.transitions, args.seed, args.num_envs)
     print(path)
     return 0
 
 
-def _recipe(args: argparse.Namespace, env: envs.TaskEnv) -> recipes.Recipe:
-    body = bodies.conduct_of(env)
+def _recipe(args: argparse.Namespace, env: envs.TaskEnv) -> recipes.CollectionRecipe:
+    body = profile_of(env)
     if args.recipe != "mixed":
         if args.mix is not None or args.degraded_share is not None:
             raise UserError(f"--recipe {args.recipe} takes neither --mix nor --degraded-share; mixed does")

@@ -1,7 +1,7 @@
-"""Where to go: from (position, goal) to a direction, cell by cell through a maze, or as far as one sees.
+"""Steering: from (position, goal) to a direction, cell by cell through a maze, or along a straight line of sight.
 
 Pure functions of a single state, for use inside jit and under vmap. A ``Navigator`` holds the maze's paths as device
-tables, so that a shortest path costs one look-up per step.
+tables, so that following a shortest path costs one look-up per step.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from envs.maze import UNIT, Maze
 from qdos_brax.nn.vectors import unit_vector
 
-_CORRIDOR = 1.2  # m to either side of a straight line that must be free: the reach of the ant's legs
-_BERTH = 3.0  # m from a wall within which a ball is led away from it
-_LEAD = 1.5  # how much at the wall itself, next to 1 towards the goal
+_CORRIDOR = 1.2  # m that must be free on either side of a straight line: the reach of the ant's legs
+_BERTH = 3.0  # m from a wall within which a ball is steered away from it
+_LEAD = 1.5  # weight of that at the wall itself, where the direction to the goal has weight 1
 _SIDES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])  # x, y
 
 
 class Navigator:
-    """A maze's shortest paths as device tables over cell indices (C = number of cells).
+    """Hold a maze's shortest paths as device tables over cell indices (C = number of cells).
 
     Args:
         maze: the layout.
@@ -37,25 +37,25 @@ class Navigator:
         self.free_xy = jnp.asarray(maze.ij_to_xy(maze.free_cells[leads_on]), jnp.float32)  # float32[F, 2]
 
     def cell(self, xy: jax.Array) -> jax.Array:
-        """int32[...], the index of the cell that holds ``xy[..., 2]``."""
+        """Return int32[...], the index of the cell that contains ``xy[..., 2]``."""
         return self.maze.cell_index(xy)
 
     def centre(self, cell: jax.Array) -> jax.Array:
-        """float32[..., 2], the centre of ``cell[...]``."""
+        """Return float32[..., 2], the centre of ``cell[...]``."""
         return self.maze.index_to_xy(cell)
 
     def random_free_xy(self, key: jax.Array) -> jax.Array:
-        """The centre[2] of a free cell, uniformly drawn."""
+        """Draw a free cell uniformly and return its centre[2]."""
         return jax.random.choice(key, self.free_xy)
 
     def random_xy_at(self, key: jax.Array, cell: jax.Array, steps: int) -> jax.Array:
-        """The centre[2] of a cell that a shortest path of ``steps`` cells leads to; of ``cell`` if there is none."""
+        """Draw a cell at ``steps`` cells along a shortest path and return its centre[2]; that of ``cell`` if none."""
         fits = self._cell_steps[cell] == steps
         drawn = jax.random.categorical(key, jnp.where(fits, 0.0, -jnp.inf))
         return self.centre(jnp.where(fits.any(), drawn, cell))
 
     def off_walls(self, xy: jax.Array) -> jax.Array:
-        """Vector[2] away from the walls that adjoin the cell of ``xy`` within the berth; 1 at a wall, falling to 0."""
+        """Return the vector[2] away from walls beside the cell of ``xy[2]``: length 1 at a wall, 0 at 3 m from it."""
         cell = self.cell(xy)
         gap = UNIT / 2 - jnp.asarray(_SIDES) @ (xy - self.centre(cell))
         nearness = jnp.where(self._wall_beside[cell], jnp.clip(1 - gap / _BERTH, 0.0, 1.0), 0.0)
@@ -63,15 +63,15 @@ class Navigator:
 
 
 def maze_direction(maze: Navigator, xy: jax.Array, goal_xy: jax.Array) -> jax.Array:
-    """Unit vector[2] from ``xy`` towards the centre of the next cell on a shortest path, or the goal in its cell."""
+    """Return the unit vector[2] from ``xy`` to the next cell on a shortest path, or to a goal in the same cell."""
     here, there = maze.cell(xy), maze.cell(goal_xy)
     return unit_vector(jnp.where(here == there, goal_xy, maze.centre(maze.next_cell[here, there])) - xy)
 
 
 def dribble_direction(maze: Navigator, ball_xy: jax.Array, goal_xy: jax.Array) -> jax.Array:
-    """Unit vector[2] along which a ball at ``ball_xy`` goes to the farthest point of its path in sight.
+    """Return the unit vector[2] from ``ball_xy`` to the farthest visible point of its path.
 
-    Straight in the open. Along a wall in an arc: a ball at the wall leaves the ant no room to get behind it.
+    The ball goes straight in the open and in an arc along a wall: at the wall the ant has no room to get behind it.
     """
     ball, goal = maze.cell(ball_xy), maze.cell(goal_xy)
     waypoint = maze.sight_cell[ball, goal]
@@ -80,7 +80,7 @@ def dribble_direction(maze: Navigator, ball_xy: jax.Array, goal_xy: jax.Array) -
 
 
 def approach(maze: Navigator, xy: jax.Array, target_xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(Unit vector[2] towards ``target_xy``, or the farthest cell in sight on the way to it; bool: it is in sight)."""
+    """Return (unit vector[2] towards ``target_xy`` or the farthest visible cell before it, bool: it is visible)."""
     here, there = maze.cell(xy), maze.cell(target_xy)
     meeting = maze.sight_cell[here, there]
     in_sight = (here == there) | (meeting == there)
@@ -88,7 +88,7 @@ def approach(maze: Navigator, xy: jax.Array, target_xy: jax.Array) -> tuple[jax.
 
 
 def _farthest_in_sight(maze: Maze) -> np.ndarray:
-    """int32[C, C]: the last cell of each shortest path that, like all before it, a straight free corridor reaches."""
+    """Compute int32[C, C], the last cell of each shortest path that, like all before it, can be walked to straight."""
     table = maze.next_step_table.copy()
     free = maze.cell_index(maze.ij_to_xy(maze.free_cells))
     for start in free:
@@ -104,7 +104,7 @@ def _farthest_in_sight(maze: Maze) -> np.ndarray:
 
 
 def _walls_beside(maze: Maze) -> np.ndarray:
-    """bool[C, 4]: whether the neighbour of a free cell on each of _SIDES is a wall."""
+    """Return bool[C, 4]: whether the neighbour of a free cell on each of _SIDES is a wall."""
     beside = np.zeros((maze.num_cells, len(_SIDES)), bool)
     for i, j in maze.free_cells:
         beside[maze.cell_index(maze.ij_to_xy(np.array([i, j])))] = [maze.grid[i + dy, j + dx] for dx, dy in _SIDES]
@@ -112,7 +112,7 @@ def _walls_beside(maze: Maze) -> np.ndarray:
 
 
 def _is_free_corridor(maze: Maze, start: int, goal: int) -> bool:
-    """Whether no wall lies within the corridor between two cells' centres, by samples an eighth of a cell apart."""
+    """Return whether the corridor between two cells' centres is free, by samples an eighth of a cell apart."""
     a, b = maze.index_to_xy(start), maze.index_to_xy(goal)
     length = float(np.linalg.norm(b - a))
     if length == 0:

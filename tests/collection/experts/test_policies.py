@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 
 import envs
-from qdos_brax.collection import bodies, collect
-from qdos_brax.collection.experts import policies
+from qdos_brax.collection.collector import Collector
+from qdos_brax.collection.experts import policies, weights
 from qdos_brax.collection.experts.poses import humanoid_is_up
 from qdos_brax.collection.experts.tasks import HumanoidWalking
-from qdos_brax.collection.experts.views import body_view, random_direction, turned
+from qdos_brax.collection.experts.views import body_view, random_direction, to_direction_frame
+from qdos_brax.collection.profiles import profile_of
 from qdos_brax.collection.recipes import named
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
@@ -49,7 +51,9 @@ def test_a_turned_world_looks_the_same(angle: float) -> None:
     same = policies.dribbler_view(*map(jnp.asarray, (*other, turned_direction)))
     np.testing.assert_allclose(view, same, atol=1e-5)
     assert view.shape == (35,)
-    np.testing.assert_allclose(turned(jnp.asarray(direction), jnp.asarray(direction)), [1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(
+        to_direction_frame(jnp.asarray(direction), jnp.asarray(direction)), [1.0, 0.0], atol=1e-6
+    )
 
 
 def test_forward_and_up_of_a_known_pose() -> None:
@@ -91,7 +95,7 @@ def test_in_front_of_the_ball_it_goes_round_it(side: float) -> None:
 def test_weights_come_back_as_they_were_written(tmp_path: Path) -> None:
     walker = policies.ant_walker()
     path = tmp_path / "copy.npz"
-    policies.write_actor(path, walker.actor)
+    weights.write_actor(path, walker.actor)
     again = policies.ant_walker(path)
     assert policies.digest(again) == policies.digest(walker)
     assert again.actor.header == walker.actor.header and again.actor.hidden == walker.actor.hidden
@@ -104,37 +108,44 @@ def test_weights_come_back_as_they_were_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["ant_walker", "ant_dribbler", "humanoid_walker"])
 def test_shipped_weights_are_small_and_say_where_they_come_from(name: str) -> None:
-    path = policies.shipped(name)
+    path = weights.shipped(name)
     assert path.stat().st_size < 5_000_000
-    header = policies.read_actor(path).header
+    header = weights.read_actor(path).header
     assert {"command", "seed", "steps", "seconds", "speed", "falls_per_1000"} <= set(header)
 
 
 @pytest.mark.slow
 def test_the_dribbler_scores() -> None:
+    """Goals per 1,000 steps, averaged over 64 episodes of ``navigate`` (OGBench's: on arrival another random goal)."""
     env = envs.make("antsoccer-arena", physics="mujoco")
-    assert collect.goals_per_1000(env, policies.ant_dribbler(), noise=0.2, seed=0) >= 5.0
-
-
-class HeldGoal(collect.Collector):
-    """Collects the task itself: from its start, always to its goal."""
-
-    def _draw(self, key: jax.Array) -> collect.Draws:
-        return super()._draw(key)._replace(goal_xy=jnp.asarray(self.env.goal_xy, jnp.float32))
-
-    def _reset_lane(self, key: jax.Array) -> collect.Lane:
-        pipeline = self.env.reset(key).pipeline_state
-        goal, (body, ball) = jnp.asarray(self.env.goal_xy, jnp.float32), (pipeline.qpos[:2], pipeline.qpos[15:17])
-        lane = super()._reset_lane(key).replace(pipeline=pipeline, observation=self.env.observe(pipeline))
-        return lane.replace(goal_xy=goal, origin_xy=ball, away_xy=body, seen_body=body, seen_cargo=ball)
+    collector = Collector(env, named("navigate", profile_of(env), noise=0.2))
+    reset_key, step_key = jax.random.split(jax.random.key(0))
+    states = collector.reset(jax.random.split(reset_key, 64))
+    states = collector.run(states, np.full(64, QUALITY["navigate"], np.int8), 1000, step_key)[1]
+    assert np.mean(states.arrivals) >= 5.0
 
 
 @pytest.mark.slow
 def test_the_dribbler_gets_the_ball_out_of_a_corner_and_along_a_wall() -> None:
-    env, noise = envs.make("antsoccer-arena-task4", physics="mujoco"), 0.2
-    collector = HeldGoal(env, policies.ant_dribbler(), named("navigate", bodies.conduct_of(env), noise))
-    kinds = np.full(32, QUALITY["navigate"], np.int8)
-    qpos = collector.run(jax.random.key(0), kinds, 1000)[0]["infos/qpos"].reshape(32, 1000, -1)
+    """The task itself: every episode starts at its start and keeps its goal."""
+    env, episodes = envs.make("antsoccer-arena-task4", physics="mujoco"), 32
+    collector = Collector(env, replace(named("navigate", profile_of(env), noise=0.2), goal_cells=1))
+    reset_key, step_key = jax.random.split(jax.random.key(0))
+    reset_keys = jax.random.split(reset_key, episodes)
+    pipeline = jax.jit(jax.vmap(env.reset))(reset_keys).pipeline_state
+    body, ball = pipeline.qpos[:, :2], pipeline.qpos[:, 15:17]
+    states = collector.reset(reset_keys).replace(
+        pipeline=pipeline,
+        observation=jax.vmap(env.observe)(pipeline),
+        has_ball=jnp.ones(episodes, bool),
+        goal_xy=jnp.tile(jnp.asarray(env.goal_xy, jnp.float32), (episodes, 1)),
+        origin_xy=ball,
+        escape_xy=body,
+        checked_body=body,
+        checked_object=ball,
+    )
+    rows = collector.run(states, np.full(episodes, QUALITY["navigate"], np.int8), 1000, step_key)[0]
+    qpos = rows["infos/qpos"].reshape(episodes, 1000, -1)
     scored = np.asarray(env.success(qpos, env.goal_xy)).astype(bool)
     assert scored.any(axis=1).mean() >= 0.9
     assert np.median(scored.argmax(axis=1)[scored.any(axis=1)]) <= 500
@@ -145,7 +156,7 @@ def test_the_humanoid_walks() -> None:
     """64 episodes of 1,000 steps from standing, each along a direction of its own, without noise."""
     task, walker, episodes = HumanoidWalking(), policies.humanoid_walker(), 64
     reset_key, direction_key = jax.random.split(jax.random.key(7))
-    lives = jax.vmap(task.reset)(jax.random.split(reset_key, episodes))
+    states = jax.vmap(task.reset)(jax.random.split(reset_key, episodes))
     direction = jax.vmap(random_direction)(jax.random.split(direction_key, episodes))
 
     def step(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], jax.Array]:
@@ -154,7 +165,7 @@ def test_the_humanoid_walks() -> None:
         way = jnp.sum((after.qpos[:, :2] - state.qpos[:, :2]) * direction, axis=1)
         return (after, is_up & humanoid_is_up(after.qpos)), way
 
-    start = (lives.pipeline, jnp.ones(episodes, bool))
+    start = (states.pipeline, jnp.ones(episodes, bool))
     (_, is_up), way = jax.jit(lambda carry: jax.lax.scan(step, carry, length=1000))(start)
     speed, fell = float(way.sum(axis=0).mean() / 25.0), 1.0 - float(is_up.mean())
     print(f"{speed:.3f} m/s along the direction, {fell:.3f} fell")

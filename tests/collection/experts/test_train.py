@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from envs.physics.base import PipelineState
-from qdos_brax.collection.experts import policies, symmetry
-from qdos_brax.collection.experts.tasks import TASKS, HumanoidRising, HumanoidWalking, Life, Verdict
-from qdos_brax.collection.experts.train import Sizes, Trainer, Training, read_learner
-from qdos_brax.collection.experts.views import random_direction, turned
+from qdos_brax.collection.experts import symmetry, weights
+from qdos_brax.collection.experts.tasks import TASKS, HumanoidRising, HumanoidWalking
+from qdos_brax.collection.experts.tasks.base import EnvState, StepResult
+from qdos_brax.collection.experts.train import Training, read_learner
+from qdos_brax.collection.experts.trainer import Sizes, Trainer
+from qdos_brax.collection.experts.views import random_direction, to_direction_frame, to_world_frame
+from qdos_brax.data.transitions import Transition
 from qdos_brax.errors import UserError
-from qdos_brax.high_level.sac import Batch
 
 SIZES = Sizes(
     num_envs=8,
@@ -46,29 +48,35 @@ class Going:
 
     name = "point"
     observation_dim, action_dim = 2, 2
-    discount, life_steps, turn_every, shake = 0.5, 20, 10, 0.0
+    discount, episode_steps, direction_steps, action_noise = 0.5, 20, 10, 0.0
     engine = Point()
 
-    def reset(self, key: jax.Array) -> Life:
-        return Life(self.engine.init(jnp.zeros(2), jnp.zeros(2)), random_direction(key), jnp.zeros((), jnp.int32))
+    def reset(self, key: jax.Array) -> EnvState:
+        return EnvState(self.engine.init(jnp.zeros(2), jnp.zeros(2)), random_direction(key), jnp.zeros((), jnp.int32))
 
-    def observe(self, life: Life) -> jax.Array:
-        return turned(life.pipeline.qpos, life.direction)
+    def observe(self, state: EnvState) -> jax.Array:
+        return to_direction_frame(state.pipeline.qpos, state.direction)
 
-    def mirror(self, batch: Batch) -> Batch:
+    def mirror(self, batch: Transition) -> Transition:
         return batch
 
-    def joints(self, life: Life, action: jax.Array) -> jax.Array:
-        return turned(action, life.direction * jnp.array([1.0, -1.0]))
+    def torques(self, state: EnvState, action: jax.Array) -> jax.Array:
+        return to_world_frame(action, state.direction)
 
-    def judge(self, before: Life, joints: jax.Array, after: PipelineState) -> Verdict:
-        way = turned(after.qpos - before.pipeline.qpos, before.direction)
+    def evaluate_step(self, before: EnvState, torques: jax.Array, after: PipelineState) -> StepResult:
+        way = to_direction_frame(after.qpos - before.pipeline.qpos, before.direction)
         reward = 1.0 - 4.0 * jnp.sum((10.0 * way - jnp.array(self.BEST)) ** 2)
-        return Verdict(reward, jnp.abs(after.qpos).max() < 1.5, jnp.zeros((), bool), {"speed": way[0]})
+        return StepResult(reward, jnp.abs(after.qpos).max() < 1.5, jnp.zeros((), bool), {"speed": way[0]})
 
 
-def training(folder: Path, seed: int = 0, learner: Path | None = None) -> Training:
-    return Training(Trainer(Going(), SIZES), folder, seed, learner, chunks_per_save=2)
+@pytest.fixture(scope="module")
+def trainer() -> Trainer:
+    """One for all tests: its programs are compiled once."""
+    return Trainer(Going(), SIZES)
+
+
+def training(trainer: Trainer, folder: Path, seed: int = 0, learner: Path | None = None) -> Training:
+    return Training(trainer, folder, seed, learner, chunks_per_save=2)
 
 
 def leaves(run: Training) -> list[np.ndarray]:
@@ -76,10 +84,10 @@ def leaves(run: Training) -> list[np.ndarray]:
     return [np.asarray(jax.random.key_data(x) if typed_key(x) else x) for x in jax.tree.leaves(run.state)]
 
 
-def test_it_learns_the_best_action_and_keeps_the_weights(tmp_path: Path) -> None:
-    run = training(tmp_path)
+def test_it_learns_the_best_action_and_keeps_the_weights(trainer: Trainer, tmp_path: Path) -> None:
+    run = training(trainer, tmp_path)
     run.run(4000, "a command")
-    actor = policies.read_actor(tmp_path / "point.npz")
+    actor = weights.read_actor(tmp_path / "point.npz")
     starts = jax.vmap(Going().reset)(jax.random.split(jax.random.key(5), 50))
     action = actor.mode(jax.vmap(Going().observe)(starts))
     np.testing.assert_allclose(action, np.tile(Going.BEST, (50, 1)), atol=0.1)
@@ -89,27 +97,27 @@ def test_it_learns_the_best_action_and_keeps_the_weights(tmp_path: Path) -> None
     assert len(curve) == 1 + 10 and curve[-1].startswith("4000,")
 
 
-def test_a_training_that_was_stopped_goes_on_exactly(tmp_path: Path) -> None:
-    whole, first = training(tmp_path / "whole"), training(tmp_path / "parts")
+def test_a_training_that_was_stopped_goes_on_exactly(trainer: Trainer, tmp_path: Path) -> None:
+    whole, first = training(trainer, tmp_path / "whole"), training(trainer, tmp_path / "parts")
     whole.run(1200)
     first.run(800)
-    second = training(tmp_path / "parts")
+    second = training(trainer, tmp_path / "parts")
     assert second.chunks_done == 4
     second.run(1200)
     for a, b in zip(leaves(whole), leaves(second), strict=True):
         np.testing.assert_array_equal(a, b)
     without_seconds = lambda row: {k: v for k, v in row.items() if k != "seconds"}  # noqa: E731
     assert list(map(without_seconds, whole.rows)) == list(map(without_seconds, second.rows))
-    fresh, other = leaves(training(tmp_path / "fresh")), leaves(training(tmp_path / "other", seed=1))
+    fresh, other = leaves(training(trainer, tmp_path / "fresh")), leaves(training(trainer, tmp_path / "other", seed=1))
     assert not np.array_equal(fresh[1], other[1])  # weights of the first layer; its biases begin at zero
 
 
 @pytest.mark.slow
-def test_a_learner_goes_on_with_an_empty_replay(tmp_path: Path) -> None:
-    run = training(tmp_path / "first")
+def test_a_learner_goes_on_with_an_empty_replay(trainer: Trainer, tmp_path: Path) -> None:
+    run = training(trainer, tmp_path / "first")
     run.run(600)
     kept = tmp_path / "first" / "point-learner.npz"
-    onward = training(tmp_path / "second", learner=kept)
+    onward = training(trainer, tmp_path / "second", learner=kept)
     for a, b in zip(jax.tree.leaves(run.state.sac), jax.tree.leaves(onward.state.sac), strict=True):
         np.testing.assert_array_equal(a, b)
     assert int(onward.state.replay.size) == 0
@@ -124,51 +132,51 @@ def test_a_learner_goes_on_with_an_empty_replay(tmp_path: Path) -> None:
 
 def test_rewards_of_the_dribble_by_hand() -> None:
     task = TASKS["ant_dribbler"]()
-    life = task.reset(jax.random.key(0)).replace(direction=jnp.array([0.0, 1.0]))
-    qpos = life.pipeline.qpos.at[:3].set(jnp.array([0.0, 0.0, 0.6])).at[3:7].set(jnp.array([1.0, 0, 0, 0]))
-    before = life.replace(pipeline=life.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 0.9]))))
-    after = life.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 1.0])))
-    verdict = task.judge(before, jnp.zeros(8), after)
-    np.testing.assert_allclose(verdict.reward, 0.5 + 40 * 0.1 - 0.3 * 0.3 + 0.2, atol=1e-5)
-    assert verdict.alive and not verdict.lost
-    far = life.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 5.1])).at[2].set(0.1))
-    verdict = task.judge(before, jnp.zeros(8), far)
-    assert verdict.lost and not verdict.alive
+    state = task.reset(jax.random.key(0)).replace(direction=jnp.array([0.0, 1.0]))
+    qpos = state.pipeline.qpos.at[:3].set(jnp.array([0.0, 0.0, 0.6])).at[3:7].set(jnp.array([1.0, 0, 0, 0]))
+    before = state.replace(pipeline=state.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 0.9]))))
+    after = state.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 1.0])))
+    result = task.evaluate_step(before, jnp.zeros(8), after)
+    np.testing.assert_allclose(result.reward, 0.5 + 40 * 0.1 - 0.3 * 0.3 + 0.2, atol=1e-5)
+    assert result.alive and not result.truncated
+    far = state.pipeline.replace(qpos=qpos.at[15:17].set(jnp.array([0.0, 5.1])).at[2].set(0.1))
+    result = task.evaluate_step(before, jnp.zeros(8), far)
+    assert result.truncated and not result.alive
 
 
 def test_rewards_of_the_humanoid_by_hand() -> None:
     task = HumanoidWalking()
-    life = task.reset(jax.random.key(0)).replace(direction=jnp.array([0.0, 1.0]))
+    state = task.reset(jax.random.key(0)).replace(direction=jnp.array([0.0, 1.0]))
     yaw = jnp.array([jnp.cos(jnp.pi / 4), 0.0, 0.0, jnp.sin(jnp.pi / 4)])  # faces +y
-    qpos = life.pipeline.qpos.at[:2].set(0.0).at[3:7].set(yaw)
-    before = life.replace(pipeline=life.pipeline.replace(qpos=qpos))
-    after = life.pipeline.replace(qpos=qpos.at[:2].set(jnp.array([0.01, 0.015])))  # 0.025 s: 0.4 m/s aside, 0.6 m/s on
-    verdict = task.judge(before, jnp.full(21, 0.5), after)
-    np.testing.assert_allclose(verdict.reward, 1.5 + 0.3 + 0.2 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
-    assert verdict.alive
-    assert not task.judge(before, jnp.zeros(21), life.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
+    qpos = state.pipeline.qpos.at[:2].set(0.0).at[3:7].set(yaw)
+    before = state.replace(pipeline=state.pipeline.replace(qpos=qpos))
+    after = state.pipeline.replace(qpos=qpos.at[:2].set(jnp.array([0.01, 0.015])))  # 0.025 s: 0.4 m/s aside, 0.6 m/s on
+    result = task.evaluate_step(before, jnp.full(21, 0.5), after)
+    np.testing.assert_allclose(result.reward, 1.5 + 0.3 + 0.2 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
+    assert result.alive
+    assert not task.evaluate_step(before, jnp.zeros(21), state.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
 
 
 def test_rewards_of_rising_by_hand() -> None:
     task = HumanoidRising()
-    life = task.reset(jax.random.key(0))
-    up = life.pipeline.qpos.at[2].set(1.2).at[3:7].set(jnp.array([1.0, 0, 0, 0]))
-    after = life.pipeline.replace(qpos=up, qvel=jnp.zeros(27).at[0].set(0.5))
-    verdict = task.judge(life, jnp.full(21, 0.5), after)
-    np.testing.assert_allclose(verdict.reward, 1.5 * 1.2 / 1.29 + np.exp(-0.25) - 0.1 * 0.25, atol=1e-5)
+    state = task.reset(jax.random.key(0))
+    up = state.pipeline.qpos.at[2].set(1.2).at[3:7].set(jnp.array([1.0, 0, 0, 0]))
+    after = state.pipeline.replace(qpos=up, qvel=jnp.zeros(27).at[0].set(0.5))
+    result = task.evaluate_step(state, jnp.full(21, 0.5), after)
+    np.testing.assert_allclose(result.reward, 1.5 * 1.2 / 1.29 + np.exp(-0.25) - 0.1 * 0.25, atol=1e-5)
     half = jnp.sqrt(0.5)
-    lying = life.pipeline.replace(qpos=up.at[2].set(0.129).at[3:7].set(jnp.array([half, half, 0, 0])))
-    verdict = task.judge(life, jnp.zeros(21), lying)
-    np.testing.assert_allclose(verdict.reward, 0.1, atol=1e-5)
-    assert verdict.alive and not verdict.lost
+    lying = state.pipeline.replace(qpos=up.at[2].set(0.129).at[3:7].set(jnp.array([half, half, 0, 0])))
+    result = task.evaluate_step(state, jnp.zeros(21), lying)
+    np.testing.assert_allclose(result.reward, 0.1, atol=1e-5)
+    assert result.alive and not result.truncated
 
 
 def test_a_mirrored_humanoid_moves_as_its_image() -> None:
     task = HumanoidWalking()
     model, rng = task.engine.model, np.random.default_rng(0)
     np.testing.assert_array_equal(symmetry.HUMANOID_ACTUATED, model.actuator_trnid[:, 0] - 1)
-    life = task.reset(jax.random.key(1)).replace(direction=jnp.array([1.0, 0.0]))
-    qpos = life.pipeline.qpos + jnp.asarray(rng.uniform(-0.2, 0.2, 28))
+    state = task.reset(jax.random.key(1)).replace(direction=jnp.array([1.0, 0.0]))
+    qpos = state.pipeline.qpos + jnp.asarray(rng.uniform(-0.2, 0.2, 28))
     qvel = jnp.asarray(rng.normal(size=27))
     action = jnp.asarray(rng.uniform(-1, 1, 21), jnp.float32)
 
@@ -178,19 +186,19 @@ def test_a_mirrored_humanoid_moves_as_its_image() -> None:
         speed = qvel[:6] * jnp.array([1.0, -1, 1, -1, 1, -1])
         return jnp.concatenate([place, joints[7:28]]), jnp.concatenate([speed, joints[34:]])
 
-    here = life.replace(pipeline=task.engine.init(qpos, qvel))
-    there = life.replace(pipeline=task.engine.init(*image(qpos, qvel)))
-    row = Batch(task.observe(here), action, jnp.zeros(()), jnp.ones(()), task.observe(here))
+    here = state.replace(pipeline=task.engine.init(qpos, qvel))
+    there = state.replace(pipeline=task.engine.init(*image(qpos, qvel)))
+    row = Transition(task.observe(here), action, jnp.zeros(()), jnp.ones(()), task.observe(here))
     seen = task.mirror(row)
     np.testing.assert_allclose(task.observe(there), seen.observation, atol=1e-5)
-    torques = task.joints(here, action)
-    torques_there = task.joints(there, seen.action)
+    torques = task.torques(here, action)
+    torques_there = task.torques(there, seen.action)
     np.testing.assert_allclose(torques_there, symmetry.mirrored_action(torques), atol=1e-5)
     assert not np.allclose(torques_there, torques, atol=0.1)
     for _ in range(4):
         here, there = (
-            life.replace(pipeline=task.engine.step(life.pipeline, joints))
-            for life, joints in ((here, torques), (there, torques_there))
+            state.replace(pipeline=task.engine.step(state.pipeline, torque))
+            for state, torque in ((here, torques), (there, torques_there))
         )
     expected = image(here.pipeline.qpos, here.pipeline.qvel)
     np.testing.assert_allclose(there.pipeline.qpos, expected[0], atol=1e-4)
