@@ -69,7 +69,8 @@ class Planner:
     def ball_start(self, key: jax.Array, body: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draw (the ball's start position[2], bool: the episode is about the ball) for a body at ``body[2]``.
 
-        In a short episode the body can only get to a ball that lies next to it, which a share of them do.
+        A short episode leaves no time to fetch the ball, so in a share WITH_BALL of them it starts next to the body and
+        the other episodes are about the body alone.
         """
         share_key, ball_key = jax.random.split(key)
         ball_xy = self.start_xy(ball_key)

@@ -138,14 +138,15 @@ def read_learner(path: Path, trainer: Trainer) -> SACState:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("expert", choices=sorted(TASKS), help="the expert to train")
-    parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, weights and training curve")
-    parser.add_argument("--steps", type=int, required=True, help="environment steps in total, earlier calls included")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all random numbers (default 0)")
-    parser.add_argument("--learner", type=Path, help="start from this EXPERT-learner.npz, with an empty replay")
-    parser.add_argument("--width", type=int, default=256, help="width of both hidden layers of every network")
-    parser.add_argument("--batch-size", type=int, default=256, help="rows per update")
-    parser.add_argument("--updates-per-step", type=int, default=16, help="critic updates per step of all environments")
+    option = parser.add_argument
+    option("expert", metavar="EXPERT", choices=sorted(TASKS), help=f"one of {', '.join(sorted(TASKS))}")
+    option("--out", metavar="DIR", type=Path, required=True, help="folder for checkpoints, weights and curve")
+    option("--steps", metavar="N", type=int, required=True, help="environment steps in total, with earlier calls")
+    option("--seed", metavar="S", type=int, default=0, help="seed of all random numbers (default 0)")
+    option("--learner", metavar="FILE", type=Path, help="start from this EXPERT-learner.npz, with an empty replay")
+    option("--width", metavar="N", type=int, default=256, help="width of both hidden layers (default 256)")
+    option("--batch-size", metavar="N", type=int, default=256, help="rows per update (default 256)")
+    option("--updates-per-step", metavar="N", type=int, default=16, help="critic updates per step (default 16)")
     args = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     sizes = Sizes(hidden=(args.width,) * 2, batch_size=args.batch_size, updates_per_step=args.updates_per_step)
