@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 
 import envs
-from envs.physics.walls import cells_in_reach
+from envs.mazes.walls import cells_in_reach
 from qdos_brax.collection.bodies import conduct_of
 from qdos_brax.collection.experts import policies
 from qdos_brax.files import write_text

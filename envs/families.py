@@ -92,7 +92,7 @@ _SOCCER_TASKS: dict[str, list[tuple[Cell, ...]]] = {
 
 FAMILIES: dict[str, Family] = {
     "antmaze": Family(
-        env_class="envs.locomotion:AntMaze",
+        env_class="envs.mazes.locomotion:AntMaze",
         observation_size=29,
         action_size=8,
         engines=("mujoco", "mjx", "mjx-warp"),
@@ -101,7 +101,7 @@ FAMILIES: dict[str, Family] = {
         tasks={**_MAZE_TASKS, "teleport": _TELEPORT_TASKS},
     ),
     "antsoccer": Family(
-        env_class="envs.soccer:AntSoccer",
+        env_class="envs.mazes.soccer:AntSoccer",
         observation_size=42,
         action_size=8,
         engines=("mujoco", "mjx", "mjx-warp"),
@@ -110,7 +110,7 @@ FAMILIES: dict[str, Family] = {
         tasks=_SOCCER_TASKS,
     ),
     "humanoidmaze": Family(
-        env_class="envs.locomotion:HumanoidMaze",
+        env_class="envs.mazes.locomotion:HumanoidMaze",
         observation_size=69,
         action_size=21,
         engines=("mujoco", "mjx", "mjx-warp"),

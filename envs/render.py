@@ -21,8 +21,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from envs.locomotion import BodyEnv
-from envs.maze import UNIT, WALL_HALF_SIZE, Maze
+from envs.mazes.locomotion import BodyEnv
+from envs.mazes.maze import UNIT, WALL_HALF_SIZE, Maze
 
 CAMERAS = ("top", "follow")
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from envs.brax_base import Env, State
 from envs.families import Cell, TaskSpec
-from envs.maze import Maze
+from envs.mazes.maze import Maze
 from envs.physics.base import Engine, PipelineState
 
 __all__ = ["GOAL_TOLERANCE", "RESET_NOISE", "START_NOISE", "TaskEnv", "TaskSpec", "labels"]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import jax
 
 from envs.physics.base import Engine, PipelineState, Sensors
-from envs.physics.mujoco_engine import MujocoEngine
+from envs.physics.mujoco.engine import MujocoEngine
 
 __all__ = ["ENGINES", "Engine", "MujocoEngine", "PipelineState", "Sensors", "resolve_physics", "why_not"]
 

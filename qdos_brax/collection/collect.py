@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from envs.mazes.soccer import BALL_QPOS
 from envs.physics.base import PipelineState
 from envs.render import steps_per_second
-from envs.soccer import BALL_QPOS
 from envs.task import GOAL_TOLERANCE, START_NOISE, TaskEnv
 from qdos_brax.collection import bodies
 from qdos_brax.collection.experts import policies

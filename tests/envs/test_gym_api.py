@@ -17,7 +17,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import envs
 from envs import gym_api
-from envs.maze import get_maze
+from envs.mazes.maze import get_maze
 from tests.envs.ogbench_reference import ogbench_env, ogbench_rollout
 from tests.envs.test_wrappers import Slider
 

@@ -17,10 +17,10 @@ import pytest
 
 import envs
 from benchmarks import exactness
-from envs.bodies import ANT
-from envs.maze import get_maze
-from envs.physics.integrators import integrate
-from envs.physics.mjx_engine import MjxEngine
+from envs.mazes.bodies import ANT
+from envs.mazes.maze import get_maze
+from envs.physics.mjx.engine import MjxEngine
+from envs.physics.mjx.integrators import integrate
 
 FREE_P99, TOUCHING_P99 = 1e-5, 1e-3  # of the error in qpos after one control step
 

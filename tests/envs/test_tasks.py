@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs import locomotion
+from envs.mazes import locomotion
 from envs.physics import resolve_physics
 
 # nq, nv, observation, action (OGBench 1.2.2)

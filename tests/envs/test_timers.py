@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import models
-from envs.physics import timers
-from envs.physics.mujoco_engine import MujocoEngine
+from envs.mazes import models
+from envs.physics.mujoco import timers
+from envs.physics.mujoco.engine import MujocoEngine
 
 
 @pytest.fixture(autouse=True)

@@ -48,7 +48,7 @@ def test_doctor_says_which_engines_run_here(monkeypatch: pytest.MonkeyPatch) -> 
 def test_its_steps_on_a_cpu_are_near_cs() -> None:
     """One kick of the ant in the air, then on the floor; and a population's axis, which joins the batch."""
     pytest.importorskip("warp", reason="the optional package warp-lang")
-    from envs.physics.warp_engine import MjxWarpEngine
+    from envs.physics.mjx.warp_engine import MjxWarpEngine
 
     env = envs.make("antmaze-medium", physics="mujoco")
     body = env.body

@@ -11,7 +11,7 @@ import pytest
 from brax.envs.base import State
 
 import envs
-from envs.maze import get_maze
+from envs.mazes.maze import get_maze
 from envs.physics import PipelineState
 from envs.task import TaskEnv, TaskSpec
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.bodies import ANT, HUMANOID, Body
 from envs.families import TaskSpec
-from envs.maze import get_maze
-from envs.models import humanoid_model
+from envs.mazes.bodies import ANT, HUMANOID, Body
+from envs.mazes.maze import get_maze
+from envs.mazes.models import humanoid_model
 from envs.physics import PipelineState
 from envs.task import RESET_NOISE, TaskEnv
 
@@ -23,7 +23,7 @@ START_POSES = 4096
 
 
 class BodyEnv(TaskEnv):
-    """A task of one of ``envs.bodies``; subclasses say which.
+    """A task of one of ``envs.mazes.bodies``; subclasses say which.
 
     Args:
         spec: which task.
@@ -52,7 +52,7 @@ class AntMaze(BodyEnv):
 class HumanoidMaze(BodyEnv):
     """A humanoid in a maze: qpos 28, qvel 27, action 21, observation 69, 40 control steps per second.
 
-    The observation is xy, joint angles, and what ``envs.bodies.HUMANOID`` senses (head height, hands and feet
+    The observation is xy, joint angles, and what ``envs.mazes.bodies.HUMANOID`` senses (head height, hands and feet
     seen from the torso, the vertical as the torso sees it, velocity of the centre of mass), then qvel.
 
     A reset drops it 1.5 high, turned at random, with random joint angles that let no two parts touch. OGBench draws

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import mujoco
 
-from envs.maze import TELEPORT_RADIUS, WALL_HALF_SIZE, Maze
-from envs.models.pairs import list_pairs
-from envs.physics.walls import WALLS, WALLS_AROUND
+from envs.mazes.maze import TELEPORT_RADIUS, WALL_HALF_SIZE, Maze
+from envs.mazes.walls import WALLS, WALLS_AROUND
+from envs.physics.mujoco.pairs import list_pairs
 
 _ANT = Path(__file__).with_name("ant.xml")
 _HUMANOID = Path(__file__).with_name("humanoid.xml")
@@ -85,7 +85,7 @@ def near_walls_humanoid(mocap: bool) -> mujoco.MjModel:
 
 
 def _compile_for_c(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
-    """What can touch is listed beforehand (see ``envs.models.pairs``); cameras and lights go, nobody sees through them.
+    """What can touch is listed beforehand (see ``envs.physics.mujoco.pairs``); cameras and lights go, nobody sees through them.
 
     MuJoCo's own reset of states that blow up is off: whoever steps the model shall see them. So are islands where all
     joints hang together: there is only one, and looking for it costs time and changes nothing.

@@ -8,8 +8,8 @@ from functools import partial
 
 import mujoco
 
-from envs import models
-from envs.maze import Maze
+from envs.mazes import models
+from envs.mazes.maze import Maze
 from envs.physics import Engine, MujocoEngine, Sensors
 
 
@@ -37,8 +37,8 @@ class Body:
         if physics == "mujoco":
             return MujocoEngine(self.near(False), layout, self.places, sensors=self.sensors)
         # imported here, for MJX takes seconds to load
-        from envs.physics.mjx_engine import MjxEngine
-        from envs.physics.warp_engine import MjxWarpEngine
+        from envs.physics.mjx.engine import MjxEngine
+        from envs.physics.mjx.warp_engine import MjxWarpEngine
 
         engine = {engine.name: engine for engine in (MjxEngine, MjxWarpEngine)}[physics]
         return engine(self.near(True), layout, self.most_contacts, self.places, sensors=self.sensors)

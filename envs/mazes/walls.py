@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.maze import Maze
+from envs.mazes.maze import Maze
 
 WALLS_AROUND = 3
 """Cells in reach of a point in a free cell, without its own."""

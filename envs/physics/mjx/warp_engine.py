@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from envs.physics.integrators import Motion
-from envs.physics.mjx_engine import MjxEngine
+from envs.physics.mjx.engine import MjxEngine
+from envs.physics.mjx.integrators import Motion
 
 # Of mujoco_warp's OverflowType: constraint rows (two kinds), pairs, contacts, convex collisions; not the iterations'.
 _DROPPED = 1 | 2 | 4 | 8 | 16

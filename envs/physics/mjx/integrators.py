@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.physics.solver import solve_positive
+from envs.physics.mjx.solver import solve_positive
 
 Motion = tuple[jax.Array, jax.Array, jax.Array]
 """qpos[nq], qvel[nv], and the acceleration[nv] found last, which the next one starts from (warm start)."""

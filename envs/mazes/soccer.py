@@ -6,9 +6,9 @@ from typing import Any
 
 import jax
 
-from envs.bodies import ANT_AND_BALL
 from envs.brax_base import State
-from envs.locomotion import BodyEnv
+from envs.mazes.bodies import ANT_AND_BALL
+from envs.mazes.locomotion import BodyEnv
 
 BALL_QPOS = ANT_AND_BALL.places[1]
 

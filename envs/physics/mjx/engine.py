@@ -1,7 +1,7 @@
 """MJX: the physics on an accelerator, whatever the size of the maze.
 
 MJX pays for every pair of geoms that could touch, so a maze of a hundred boxes is out of the question: only the walls
-in reach are there, boxes that are moved before each control step (``envs.physics.walls``). The ball has boxes of its
+in reach are there, boxes that are moved before each control step (``envs.mazes.walls``). The ball has boxes of its
 own, kept apart by collision bits.
 """
 
@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from envs.maze import WALL_HALF_SIZE, Maze
+from envs.mazes.maze import WALL_HALF_SIZE, Maze
+from envs.mazes.walls import cells_in_reach
 from envs.physics.base import PipelineState, Sensors
-from envs.physics.constraints import Constraints
-from envs.physics.integrators import Motion, integrate
-from envs.physics.solver import solve
-from envs.physics.walls import cells_in_reach
+from envs.physics.mjx.constraints import Constraints
+from envs.physics.mjx.integrators import Motion, integrate
+from envs.physics.mjx.solver import solve
 
 # Of mjx.forward: without its factorisation of M, its contacts and its solver.
 _STAGES = (
@@ -39,7 +39,7 @@ class MjxEngine:
 
     Args:
         model: the bodies on an open floor, with mocap boxes for the walls around each, in the order of ``bodies``.
-            All its constraints have to be one-sided (limits, pyramidal contacts), see ``envs.physics.solver``.
+            All its constraints have to be one-sided (limits, pyramidal contacts), see ``envs.physics.mjx.solver``.
         layout: the maze.
         most_contacts: by dimension, how many contacts are kept, the deepest ones.
         bodies: where in qpos the x of each body lies.

@@ -1,4 +1,4 @@
-"""The constraints of a state: joint limits, and the contacts that are deepest, as rows for ``envs.physics.solver``.
+"""The constraints of a state: joint limits, and the contacts that are deepest, as rows for ``envs.physics.mjx.solver``.
 
 MuJoCo documentation, "Computation" (constraint model), for pyramidal cones. Everything that a pair of geoms decides
 (friction, stiffness, which joints move the one against the other) is tabulated beforehand, so that a step finds the
@@ -17,7 +17,7 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
-from envs.physics.contacts import COLLIDERS
+from envs.physics.mjx.contacts import COLLIDERS
 
 
 class Rows(NamedTuple):

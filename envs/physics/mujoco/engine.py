@@ -19,10 +19,10 @@ import numpy as np
 from flax import struct
 from mujoco.batch import Batch
 
-from envs.maze import UNIT, WALL_HALF_SIZE, Maze
-from envs.physics import timers
+from envs.mazes.maze import UNIT, WALL_HALF_SIZE, Maze
+from envs.mazes.walls import cells_in_reach
 from envs.physics.base import PipelineState, Sensors
-from envs.physics.walls import cells_in_reach
+from envs.physics.mujoco import timers
 
 _SUNK = -100.0  # height of a box that stands for no wall
 _SENSED_FIELDS = ("xpos", "xmat", "sensordata")
@@ -46,7 +46,7 @@ class MujocoEngine:
     Args:
         model: the compiled model; no activation states and no plugins (the ant and humanoid tasks have none). With a
             layout, it has ``WALLS`` boxes for each body in turn, geoms of the world called "ant_wall_0", .., which this
-            body alone can touch, and its pairs of geoms are listed (``envs.models.pairs``), since MuJoCo's search would
+            body alone can touch, and its pairs of geoms are listed (``envs.physics.mujoco.pairs``), since MuJoCo's search would
             not see that boxes move.
         layout: the maze; its walls in reach are put in place before each control step, which is bit for bit the same
             as with all of them, and costs less. None leaves the model as it is.
