@@ -9,7 +9,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from envs.task import RESET_NOISE, TaskEnv
+from envs.mazes.maze_task import RESET_NOISE, MazeTask
+from envs.task import Task
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.poses import humanoid_is_up, standing_humanoid
 from qdos_brax.errors import UserError
@@ -36,13 +37,13 @@ class Conduct:
     """
 
     expert: Callable[[], policies.Policy]
-    start: Callable[[TaskEnv, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+    start: Callable[[MazeTask, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
     is_down: Callable[[jax.Array], jax.Array] | None
     heavy_noise: float
     stitch_steps: int
 
 
-def conduct_of(env: TaskEnv) -> Conduct:
+def conduct_of(env: Task) -> Conduct:
     """That of the task's body.
 
     Raises:
@@ -56,12 +57,12 @@ def conduct_of(env: TaskEnv) -> Conduct:
     return CONDUCTS[env.spec.family]
 
 
-def _as_the_task(env: TaskEnv, ahead: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _as_the_task(env: MazeTask, ahead: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     start = env.reset(key).pipeline_state
     return start.qpos, start.qvel
 
 
-def _on_its_feet(env: TaskEnv, ahead: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _on_its_feet(env: MazeTask, ahead: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Facing its way, about. The task drops it, and its walker cannot get up."""
     pose_key, yaw_key, qvel_key = jax.random.split(key, 3)
     yaw = jnp.arctan2(ahead[1], ahead[0]) + YAW_NOISE * jax.random.normal(yaw_key)

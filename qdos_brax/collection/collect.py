@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from envs.mazes.maze_task import GOAL_TOLERANCE, START_NOISE, MazeTask
 from envs.mazes.soccer import BALL_QPOS
 from envs.physics.base import PipelineState
 from envs.render import steps_per_second
-from envs.task import GOAL_TOLERANCE, START_NOISE, TaskEnv
 from qdos_brax.collection import bodies
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.steering import Navigator, approach, dribble_direction, maze_direction
@@ -119,7 +119,7 @@ class Lane(struct.PyTreeNode):
 
 
 def collect(
-    env: TaskEnv,
+    env: MazeTask,
     transitions: int,
     recipe: Recipe,
     seed: int,
@@ -176,7 +176,7 @@ def check_size(transitions: int, seed: int, num_envs: int) -> None:
         raise UserError(f"seed must be 0 or more, num_envs 1 or more; got {seed}, {num_envs}")
 
 
-def goals_per_1000(env: TaskEnv, policy: policies.Policy, noise: float, seed: int, episodes: int = 64) -> float:
+def goals_per_1000(env: MazeTask, policy: policies.Policy, noise: float, seed: int, episodes: int = 64) -> float:
     """Goals reached per 1,000 steps, by episodes of the ``navigate`` recipe (soccer: by the ball), on average.
 
     As in OGBench's script, a goal is a random free cell, and on arrival another is drawn.
@@ -202,7 +202,7 @@ class Collector:
         recipe: what is done.
     """
 
-    def __init__(self, env: TaskEnv, policy: policies.Policy, recipe: Recipe) -> None:
+    def __init__(self, env: MazeTask, policy: policies.Policy, recipe: Recipe) -> None:
         self.env, self.recipe, self.body = env, recipe, bodies.conduct_of(env)
         self.dribbler = policy if isinstance(policy, policies.Dribbles) else None
         self.walker = policies.walker_of(policy)
@@ -337,7 +337,7 @@ class Collector:
             away_xy=self.navigator.random_free_xy(away_key),
             turn=jax.random.uniform(turn_key),
             heading=random_direction(heading_key),
-            noise=jax.random.normal(noise_key, (self.env.engine.nu,)),
+            noise=jax.random.normal(noise_key, (self.env.action_size,)),
             teleport=teleport_key,
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 import qdos_brax
-from envs.task import TaskEnv
+from envs.mazes.maze_task import MazeTask
 from qdos_brax.collection import bodies, collect, recipes
 from qdos_brax.collection.experts import policies
 from qdos_brax.data import formats
@@ -20,7 +20,7 @@ from qdos_brax.data.quality import QUALITY
 
 
 def default_dataset(
-    env: TaskEnv, transitions: int, degraded_share: float, noise: float, seed: int, num_envs: int = 64
+    env: MazeTask, transitions: int, degraded_share: float, noise: float, seed: int, num_envs: int = 64
 ) -> Path:
     """The path of the set with these parameters; collects it if it is not there.
 
@@ -54,7 +54,7 @@ def default_dataset(
 
 def make_file(
     path: Path,
-    env: TaskEnv,
+    env: MazeTask,
     transitions: int,
     recipe: recipes.Recipe,
     seed: int,

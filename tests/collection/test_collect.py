@@ -39,7 +39,7 @@ class StandInDribbler(StandIn):
         return -super().act(qpos, qvel, direction)
 
 
-def expert(env: envs.TaskEnv) -> StandIn:
+def expert(env: envs.Task) -> StandIn:
     return StandInDribbler() if env.spec.family == "antsoccer" else StandIn()
 
 
@@ -47,12 +47,12 @@ DEFAULT = recipes.degraded(0.5, bodies.ANT)
 
 
 @pytest.fixture(scope="module", params=["antmaze-medium", "antsoccer-arena"])
-def env(request: Any) -> envs.TaskEnv:
+def env(request: Any) -> envs.Task:
     return envs.make(request.param, physics="mujoco")
 
 
 @pytest.fixture(scope="module")
-def rows(env: envs.TaskEnv) -> dict[str, np.ndarray]:
+def rows(env: envs.Task) -> dict[str, np.ndarray]:
     seen: list[tuple[int, int]] = []
     rows = collect.collect(
         env, ROWS, DEFAULT, seed=0, num_envs=2, progress=lambda *at: seen.append(at), policy=expert(env)
@@ -61,7 +61,7 @@ def rows(env: envs.TaskEnv) -> dict[str, np.ndarray]:
     return rows
 
 
-def test_rows_fit_the_task(env: envs.TaskEnv, rows: dict[str, np.ndarray]) -> None:
+def test_rows_fit_the_task(env: envs.Task, rows: dict[str, np.ndarray]) -> None:
     assert {len(value) for value in rows.values()} == {ROWS}
     assert rows["observations"].shape[1] == env.observation_size
     assert np.abs(rows["actions"]).max() <= 1.0
@@ -73,7 +73,7 @@ def test_rows_fit_the_task(env: envs.TaskEnv, rows: dict[str, np.ndarray]) -> No
         assert len(np.unique(rows["infos/quality"][first : first + 50])) == 1  # one kind per episode
 
 
-def test_next_observations_are_what_the_engine_makes_of_the_row(env: envs.TaskEnv, rows: dict[str, np.ndarray]) -> None:
+def test_next_observations_are_what_the_engine_makes_of_the_row(env: envs.Task, rows: dict[str, np.ndarray]) -> None:
     inside = ~rows["timeouts"]
     inside[-1] = False
     shifted = np.roll(rows["observations"], -1, axis=0)
@@ -88,7 +88,7 @@ def test_next_observations_are_what_the_engine_makes_of_the_row(env: envs.TaskEn
 
 # Soccer alone: it does all that a maze does, and a second collection takes time.
 @pytest.mark.parametrize("env", ["antsoccer-arena"], indirect=True)
-def test_one_seed_repeats_and_two_differ(env: envs.TaskEnv, rows: dict[str, np.ndarray]) -> None:
+def test_one_seed_repeats_and_two_differ(env: envs.Task, rows: dict[str, np.ndarray]) -> None:
     again = collect.collect(env, ROWS, DEFAULT, seed=0, num_envs=2, policy=expert(env))
     for key, value in rows.items():
         np.testing.assert_array_equal(again[key], value, err_msg=key)
@@ -178,7 +178,7 @@ def test_small_sets_have_shorter_episodes(transitions: int, num_envs: int, lengt
 
 
 @pytest.mark.parametrize("wrong", [{"transitions": 10}, {"num_envs": 0}, {"seed": -1}])
-def test_arguments_out_of_range_are_refused(env: envs.TaskEnv, wrong: dict[str, Any]) -> None:
+def test_arguments_out_of_range_are_refused(env: envs.Task, wrong: dict[str, Any]) -> None:
     right = {"transitions": 200, "recipe": DEFAULT, "seed": 0, "num_envs": 2, "policy": expert(env)}
     with pytest.raises(UserError):
         collect.collect(env, **(right | wrong))

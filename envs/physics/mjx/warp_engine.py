@@ -29,9 +29,9 @@ _DROPPED = 1 | 2 | 4 | 8 | 16
 
 
 class MjxWarpEngine(MjxEngine):
-    """As ``MjxEngine``, but for the sub-steps; all ``vmap`` axes become one batch of worlds.
+    """Step as ``MjxEngine``, but for the sub-steps; all ``vmap`` axes become one batch of worlds.
 
-    It runs on a CPU too (slowly; for tests). Where it may be chosen says ``envs.physics.why_not``.
+    It runs on a CPU too (slowly; for tests). ``envs.physics.why_not`` returns where it may be chosen.
     """
 
     name = "mjx-warp"
@@ -41,24 +41,24 @@ class MjxWarpEngine(MjxEngine):
         self._warp_model = mjx.put_model(self.model, impl="warp")
         self._worlds: dict[int, mjx.Data] = {}
 
-    def _move(self, start: Motion, walls: jax.Array, action: jax.Array) -> Motion:
-        return _as_one_batch(self._move_batch)(*start, walls, action)
+    def _move(self, start: Motion, mocap: jax.Array, action: jax.Array) -> Motion:
+        return _as_one_batch(self._move_batch)(*start, mocap, action)
 
     def _move_batch(
-        self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, walls: jax.Array, action: jax.Array
+        self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, mocap: jax.Array, action: jax.Array
     ) -> Motion:
         """All sub-steps of n worlds; arguments and results have n rows."""
         blank = jax.tree.map(_constant, self._blank_worlds(len(qpos)))
 
         def world(
-            qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, walls: jax.Array, action: jax.Array
+            qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, mocap: jax.Array, action: jax.Array
         ) -> Motion:
-            data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, mocap_pos=walls, ctrl=action)
+            data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, mocap_pos=mocap, ctrl=action)
             data, _ = jax.lax.scan(lambda d, _: (mjx.step(self._warp_model, d), None), data, None, self.frame_skip)
             dropped = (data._impl.overflow & _DROPPED) != 0
             return jnp.where(dropped, jnp.nan, data.qpos), data.qvel, data.qacc_warmstart
 
-        return jax.vmap(world)(qpos, qvel, warmstart, walls, action)
+        return jax.vmap(world)(qpos, qvel, warmstart, mocap, action)
 
     def _blank_worlds(self, n: int) -> mjx.Data:
         """MJX's data of one world, with buffers for ``n``, in NumPy."""
