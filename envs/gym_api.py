@@ -1,8 +1,9 @@
 """The tasks for learners that speak Gymnasium: NumPy in, NumPy out.
 
 Importing this module registers every task that ``envs`` knows by then (see ``register_tasks``):
-``qdos/antmaze-large-v0`` with its default task and ``qdos/antmaze-large-task3-v0`` with that one. ``gymnasium.make`` gives
-one environment, ``gymnasium.make_vec`` a batch of them that one compiled program steps, on MuJoCo C (in threads) or MJX.
+``qdos/antmaze-large-v0`` with its default task and ``qdos/antmaze-large-task3-v0`` with that one. ``gymnasium.make``
+gives one environment, ``gymnasium.make_vec`` a batch of them that one compiled program steps, on MuJoCo C (in threads)
+or MJX.
 
 Observation, reward, success and cap are the task's: success, read on the state before the action, terminates an
 episode, the cap truncates it. Environment 0 of a batch starts as the single one with the same seed.

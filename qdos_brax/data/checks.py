@@ -126,9 +126,8 @@ def _compare_rewards(rows: Rows, env: Task, attributes: Mapping[str, Any], found
     differ = env.file_rewards(rows.rewards) != rewards
     if not differ.any():
         return
-    if attributes.get("env") == env.spec.full_name:
-        found.errors.append(
-            f"rewards disagree with {env.spec.full_name}, which they were made for, in {count_rows(differ)}"
-        )
+    where, name = count_rows(differ), env.spec.full_name
+    if attributes.get("env") == name:
+        found.errors.append(f"rewards disagree with {name}, which they were made for, in {where}")
     else:
         found.notes.append(f"rewards of another task or goal in {where}; they are made anew for the task")
