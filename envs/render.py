@@ -67,6 +67,8 @@ class Renderer:
             raise ValueError(f"a frame of {height} x {width} has no pixels; height and width start at 1")
         self._model = scene.model
         self._goal_marker = scene.goal_marker
+        if scene.goal_marker is not None:  # MuJoCo ignores the place of a geom that was compiled at its body's
+            self._model.geom_sameframe[self._model.geom(scene.goal_marker).id] = 0
         self._model.vis.global_.offheight = height
         self._model.vis.global_.offwidth = width
         self._data = mujoco.MjData(self._model)

@@ -107,6 +107,11 @@ class Task(Env, ABC):
         return self.engine.action_size
 
     @property
+    def extra_size(self) -> int:
+        """Return the numbers of the discrete state."""
+        return self.engine.extra_size
+
+    @property
     def backend(self) -> str:
         """Return the engine's name."""
         return self.engine.name

@@ -31,6 +31,7 @@ class PointEnv(Env):
     action_size = 2
     episode_length = 60
     backend = "toy"
+    extra_size = 0
 
     def reset(self, rng):
         return self.reset_to(0.1 * jax.random.normal(rng, (2,)), jnp.zeros(2), GOAL, rng)

@@ -80,14 +80,14 @@ def horizon_lines(ends: np.ndarray, horizon: int) -> tuple[list[str], list[str]]
 def _sizes(rows: Rows, env: Task) -> list[str]:
     obs, act = env.observation_size, env.action_size
     widths = {"observations": obs, "next_observations": obs, "actions": act}
-    widths |= {"qpos": env.engine.nq, "qvel": env.engine.nv, "extra": env.engine.extra_size}
+    widths |= {"qpos": env.engine.nq, "qvel": env.engine.nv, "extra": env.extra_size}
     lines = []
     for key, width in widths.items():
         array = getattr(rows, key)
         if array is not None and array.shape != (rows.size, width):
             shape = "x".join(map(str, array.shape[1:])) or "1"
             lines.append(f"{key} has {shape} numbers per row, {env.spec.name} has {width}: made for another task?")
-    if env.engine.extra_size and rows.qpos is not None and rows.extra is None:
+    if env.extra_size and rows.qpos is not None and rows.extra is None:
         lines.append(f"qpos without infos/extra, the discrete state of {env.spec.name}: the states are not whole")
     return lines
 

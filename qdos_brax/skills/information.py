@@ -6,8 +6,9 @@ from functools import partial
 from typing import Any
 
 import jax
-from brax.envs.base import Env, State
+from brax.envs.base import State
 
+from envs.task import Task
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.data.segments import window
 from qdos_brax.errors import UserError
@@ -28,10 +29,14 @@ class PhysicsRollout:
         UserError: it holds none.
     """
 
-    def __init__(self, env: Env, model: SkillModel, normaliser: Normaliser, horizon: int, data: DeviceData) -> None:
+    def __init__(self, env: Task, model: SkillModel, normaliser: Normaliser, horizon: int, data: DeviceData) -> None:
         if data.qpos is None or data.qvel is None:
             raise UserError(
                 "the data set holds no qpos and qvel to start rollouts from; use --set skills.mi_rollout=logged"
+            )
+        if env.extra_size and data.extra is None:
+            raise UserError(
+                "the data set holds no discrete state to start rollouts from; use --set skills.mi_rollout=logged"
             )
         self._env, self._model, self._normalise, self._horizon = env, model, normaliser, horizon
 

@@ -20,7 +20,7 @@ from mujoco.mjx._src import collision_driver
 from envs.physics.mjx.contacts import COLLIDERS
 
 
-class Rows(NamedTuple):
+class ConstraintRows(NamedTuple):
     """Constraints a >= r on accelerations: rows of zeros stand for those that are not in force.
 
     Attributes:
@@ -101,11 +101,11 @@ class Constraints:
         per_contact = (pairs.keep * max(1, 2 * (pairs.dimension - 1)) for pairs in self._pairs)
         return len(self._limited) + sum(per_contact)
 
-    def rows(self, data: mjx.Data) -> Rows:
+    def rows(self, data: mjx.Data) -> ConstraintRows:
         """Of a state whose kinematics, centres of mass and ``qvel`` are in ``data``."""
         found = [self._limit_rows(data), *(self._contact_rows(data, pairs) for pairs in self._pairs)]
         jacobian, stiffness, stretch, damping = (jnp.concatenate(part) for part in zip(*found, strict=True))
-        return Rows(jacobian, stiffness, -damping * (jacobian @ data.qvel) - stretch)
+        return ConstraintRows(jacobian, stiffness, -damping * (jacobian @ data.qvel) - stretch)
 
     def _limit_rows(self, data: mjx.Data) -> tuple[jax.Array, ...]:
         model, joints = self._model, self._limited
