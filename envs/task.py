@@ -17,34 +17,33 @@ from envs.scene import Scene, free_view
 
 
 class SimulatorStates(Protocol):
-    """Hold simulator states: a ``PipelineState``, or the rows of a data set.
-
-    Attributes:
-        qpos: [..., nq].
-        qvel: [..., nv].
-        extra: [..., e], or None for tasks without discrete state.
-    """
+    """Hold simulator states: a ``PipelineState``, or the rows of a data set."""
 
     @property
-    def qpos(self) -> Any: ...
+    def qpos(self) -> Any:
+        """Return [..., nq]."""
+
     @property
-    def qvel(self) -> Any: ...
+    def qvel(self) -> Any:
+        """Return [..., nv]."""
+
     @property
-    def extra(self) -> Any: ...
+    def extra(self) -> Any:
+        """Return int[..., e], or None for tasks without discrete state."""
 
 
 class StateRows(SimulatorStates, Protocol):
-    """Hold rows of a data set, one transition each; ``qpos`` and ``qvel`` may be None.
-
-    Attributes:
-        observations: float32[N, obs].
-        next_observations: float32[N, obs].
-    """
+    """Hold rows of a data set, one transition each; ``qpos`` and ``qvel`` may be None."""
 
     @property
-    def observations(self) -> np.ndarray: ...
+    def observations(self) -> np.ndarray:
+        """Return float32[N, obs]."""
+        ...
+
     @property
-    def next_observations(self) -> np.ndarray: ...
+    def next_observations(self) -> np.ndarray:
+        """Return float32[N, obs], the true next ones."""
+        ...
 
 
 class FloorMap(NamedTuple):
@@ -176,13 +175,13 @@ class Task(Env, ABC):
         )
 
     def observe(self, pipeline_state: PipelineState) -> jax.Array:
-        """Return float32[obs], what is seen of a state; qpos and qvel unless a task says otherwise."""
+        """Return float32[obs], what is seen of a state; qpos and qvel unless a task overrides it."""
         return jnp.concatenate([pipeline_state.qpos, pipeline_state.qvel])
 
     def labels(self, states: SimulatorStates, goal: Any = None) -> tuple[Any, Any]:
         """Return (reward[...], mask[...]) of states before the action, online and for data alike; NumPy or jax.
 
-        The reward is success - 1, the mask 1 - success, unless a task says otherwise.
+        The reward is success - 1, the mask 1 - success, unless a task overrides it.
 
         Args:
             states: where the action was taken.
@@ -192,7 +191,7 @@ class Task(Env, ABC):
         return success - 1.0, 1.0 - success
 
     def file_rewards(self, rewards: np.ndarray) -> np.ndarray:
-        """Return a file's own rewards float32[N] on the task's scale; as they are unless a task says otherwise."""
+        """Return a file's own rewards float32[N] on the task's scale; as they are unless a task overrides it."""
         return rewards
 
     def check_rows(self, rows: StateRows) -> list[str]:
@@ -204,7 +203,7 @@ class Task(Env, ABC):
         return []
 
     def scene(self) -> Scene:
-        """Return how the task is drawn; the engine's model from MuJoCo's own camera unless a task says otherwise."""
+        """Return how the task is drawn; the engine's model from MuJoCo's own camera unless a task overrides it."""
         return Scene(copy.deepcopy(self.engine.model), {"free": free_view})
 
     def position(self, qpos: Any) -> dict[str, Any] | None:

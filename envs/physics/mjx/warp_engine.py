@@ -1,4 +1,4 @@
-"""MuJoCo Warp through MJX: NVIDIA's kernels for the sub-steps, for large batches on a CUDA device.
+"""Step with MuJoCo Warp through MJX: NVIDIA's kernels for the sub-steps, for large batches on a CUDA device.
 
 Walls, coordinates and sensors are those of ``MjxEngine``; the sub-steps are ``mjx.step`` with ``impl="warp"``: Warp's
 own contacts and solver. Against MuJoCo C a control step agrees to 1e-6 (median) in free flight; in contact, with the
@@ -47,7 +47,7 @@ class MjxWarpEngine(MjxEngine):
     def _move_batch(
         self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, mocap: jax.Array, action: jax.Array
     ) -> Motion:
-        """All sub-steps of n worlds; arguments and results have n rows."""
+        """Make all sub-steps of n worlds; arguments and results have n rows."""
         blank = jax.tree.map(_constant, self._blank_worlds(len(qpos)))
 
         def world(
@@ -61,7 +61,7 @@ class MjxWarpEngine(MjxEngine):
         return jax.vmap(world)(qpos, qvel, warmstart, mocap, action)
 
     def _blank_worlds(self, n: int) -> mjx.Data:
-        """MJX's data of one world, with buffers for ``n``, in NumPy."""
+        """Return MJX's data of one world, with buffers for ``n``, in NumPy."""
         if n not in self._worlds:
             contacts = n * self._constraints.num_pairs
             with jax.ensure_compile_time_eval():
@@ -71,14 +71,14 @@ class MjxWarpEngine(MjxEngine):
 
 
 def _constant(leaf: np.ndarray) -> jax.Array:
-    """``leaf`` inside a program; buffers that are all one number are made there, for they are large."""
+    """Return ``leaf`` inside a program; buffers that are all one number are made there, for they are large."""
     if leaf.size and (leaf == leaf.flat[0]).all():
         return jnp.full(leaf.shape, leaf.flat[0], leaf.dtype)
     return jnp.asarray(leaf)
 
 
 def _as_one_batch(batched: Callable[..., Motion]) -> Callable[..., Motion]:
-    """A function of single rows from one of n rows, that any number of ``vmap`` s call once, with all rows."""
+    """Return a function of single rows from one of n rows, that any number of ``vmap`` s call once, with all rows."""
 
     @jax.custom_batching.custom_vmap
     def rows(*args: jax.Array) -> Motion:

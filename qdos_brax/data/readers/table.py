@@ -137,6 +137,7 @@ class NpzTable(DataTable):
         self._zip.close()
 
     def blocks(self, key: str) -> Iterator[np.ndarray]:
+        """Yield the rows of a column in order, the whole of it where it is stored column by column."""
         with self._zip.open(f"{key}.npy") as member:
             shape, column_major, dtype = _npy_header(member)
             num_rows = shape[0]
@@ -181,6 +182,7 @@ class HDF5Table(DataTable):
             self._file.close()
 
     def blocks(self, key: str) -> Iterator[np.ndarray]:
+        """Yield the rows of a column in order, whole chunks at a time."""
         values = self._sets[key]
         crc = checksum_start(values.shape, values.dtype)
         per_block = _rows_per_block(values.shape, values.dtype)
