@@ -93,7 +93,7 @@ def state_values(
 
 def correlation(env: Any, dataset: Dataset, values: np.ndarray) -> float:
     """Return Pearson's correlation of V with minus the true distance, over the states whose distance is known."""
-    distance = np.asarray(env.true_distance(dataset.qpos), np.float64)
+    distance = np.asarray(env.distance_left(dataset.qpos), np.float64)
     known = np.isfinite(distance)
     return float(np.corrcoef(values[known], -distance[known])[0, 1]) if values.std() > 0 else float("nan")
 
@@ -141,7 +141,7 @@ def rows_of(
             weights = np.asarray(advantage_weights(scaled, temperature, float(np.mean(config.skills.weight_clip))))
             rows.append(
                 {"values": values, "advantage": advantage, "lambda": temperature}
-                | quality.report(score, weights, gains, degraded)
+                | quality.report(score, weights, gains, env.distance_margin, degraded)
                 | {"value_correlation": value_correlation, "values_seconds": round(seconds, 1)}
             )
     return rows

@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 
 import envs
-from envs.physics.walls import cells_in_reach
+from envs.mazes.walls import cells_in_reach
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.views import direction_of
 from qdos_brax.collection.profiles import profile_of

@@ -8,16 +8,28 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from envs.families import FAMILIES, Family, TaskSpec
-from envs.registry import ALIASES, get_spec, list_tasks, make
+from envs.families import Family, TaskSpec, Variant
+from envs.registry import ALIASES, FAMILIES, get_spec, list_tasks, make, register_family
 
 if TYPE_CHECKING:
-    from envs.task import TaskEnv
+    from envs.task import Task
     from envs.wrappers import AutoReset
 
-__all__ = ["ALIASES", "FAMILIES", "AutoReset", "Family", "TaskEnv", "TaskSpec", "get_spec", "list_tasks", "make"]
+__all__ = [
+    "ALIASES",
+    "FAMILIES",
+    "AutoReset",
+    "Family",
+    "Task",
+    "TaskSpec",
+    "Variant",
+    "get_spec",
+    "list_tasks",
+    "make",
+    "register_family",
+]
 
-_LOADED_LATER = {"AutoReset": "envs.wrappers", "TaskEnv": "envs.task"}
+_LOADED_LATER = {"AutoReset": "envs.wrappers", "Task": "envs.task"}
 
 
 def __getattr__(name: str) -> Any:

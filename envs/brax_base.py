@@ -1,4 +1,4 @@
-"""Brax's environment classes, imported without a word."""
+"""Import Brax's environment classes without printed lines."""
 
 import contextlib
 import io

@@ -1,8 +1,9 @@
 """The tasks for learners that speak Gymnasium: NumPy in, NumPy out.
 
-Importing this module registers every task: ``qdos/antmaze-large-v0`` with its default task and
-``qdos/antmaze-large-task3-v0`` with that one. ``gymnasium.make`` gives one environment, ``gymnasium.make_vec`` a batch
-of them that one compiled program steps, on MuJoCo C (in threads) or MJX.
+Importing this module registers every task that ``envs`` knows by then (see ``register_tasks``):
+``qdos/antmaze-large-v0`` with its default task and ``qdos/antmaze-large-task3-v0`` with that one. ``gymnasium.make``
+gives one environment, ``gymnasium.make_vec`` a batch of them that one compiled program steps, on MuJoCo C (in threads)
+or MJX.
 
 Observation, reward, success and cap are the task's: success, read on the state before the action, terminates an
 episode, the cap truncates it. Environment 0 of a batch starts as the single one with the same seed.
@@ -10,34 +11,30 @@ episode, the cap truncates it. Environment 0 of a batch starts as the single one
 
 from __future__ import annotations
 
-import functools
-import inspect
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import gymnasium
-import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from envs.brax_base import State
-from envs.registry import get_spec, list_tasks, make
+from envs.gym_programs import checked, programs, started, to_numpy
+from envs.registry import get_spec, list_tasks
 from envs.render import Renderer, steps_per_second
-from envs.task import TaskEnv
-from envs.wrappers import AutoReset
+from envs.task import Task
 
 _METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10.0}
 
 
 class _Backed:
-    """What one environment and a batch have in common: the programs, the renderer and the state."""
+    """Hold what one environment and a batch have in common: the programs, the renderer and the state."""
 
     metadata: dict[str, Any]
 
     def _open(self, task: str, physics: str, render_mode: str | None, frames: Mapping[str, Any]) -> None:
-        self._programs = _programs(get_spec(task).full_name, physics)
+        self._programs = programs(get_spec(task).full_name, physics)
         self.task = self._programs.task
         self.metadata = self.metadata | {"render_fps": steps_per_second(self.task)}
         self.render_mode = render_mode
@@ -45,24 +42,24 @@ class _Backed:
         self._state: State | None = None
 
     def _frames(self) -> tuple[np.ndarray, ...] | None:
-        """Every environment's state as uint8[height, width, 3]; None without a render mode."""
+        """Return every environment's state as uint8[height, width, 3]; None without a render mode."""
         if self._renderer is None:
             return None
-        state = _started(self._state)
-        states = zip(np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal_xy"]), strict=True)
-        return tuple(self._renderer.frame(qpos, goal_xy) for qpos, goal_xy in states)
+        state = started(self._state)
+        states = zip(np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal"]), strict=True)
+        return tuple(self._renderer.frame(qpos, goal) for qpos, goal in states)
 
     def _release(self) -> None:
-        """Gives the OpenGL context back."""
+        """Give the OpenGL context back."""
         if self._renderer is not None:
             self._renderer.close()
 
 
 class TaskGymEnv(_Backed, gymnasium.Env):
-    """One environment.
+    """Run one environment.
 
-    ``info["success"]`` (bool) tells of the step just made. Physics that is no longer finite truncates the episode, with
-    the last finite observation.
+    ``info["success"]`` (bool) is that of the step just made. Physics that is no longer finite truncates the episode,
+    with the last finite observation.
 
     Args:
         task: a name that ``envs.make`` knows.
@@ -87,7 +84,7 @@ class TaskGymEnv(_Backed, gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """The start of an episode: observation float32[obs] and info.
+        """Return the start of an episode: observation float32[obs] and info.
 
         Args:
             seed: makes everything from here on repeatable; None goes on with the random numbers of the last seed.
@@ -101,14 +98,14 @@ class TaskGymEnv(_Backed, gymnasium.Env):
         return np.array(self._state.obs)[0], {"success": False}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One control step under ``action[act]``, which the motors clip to [-1, 1].
+        """Return what one control step under ``action[act]`` brings; the motors clip to [-1, 1].
 
         Raises:
             ValueError: the action's shape is wrong or it is not finite.
         """
-        state = _started(self._state)
-        self._state, out = self._programs.step(state, _checked(action, self.action_space)[None])
-        out = _to_numpy(out)
+        state = started(self._state)
+        self._state, out = self._programs.step(state, checked(action, self.action_space)[None])
+        out = to_numpy(out)
         finite = bool(np.isfinite(out.obs).all())
         return (
             out.obs[0] if finite else np.array(state.obs)[0],
@@ -119,20 +116,20 @@ class TaskGymEnv(_Backed, gymnasium.Env):
         )
 
     def render(self) -> np.ndarray | None:
-        """The state as uint8[height, width, 3]; None without a render mode."""
+        """Return the state as uint8[height, width, 3]; None without a render mode."""
         frames = self._frames()
         return None if frames is None else frames[0]
 
     def close(self) -> None:
-        """Gives the OpenGL context back."""
+        """Give the OpenGL context back."""
         self._release()
 
 
 class TaskVectorEnv(_Backed, gymnasium.vector.VectorEnv):
-    """A batch of environments, stepped by one compiled program.
+    """Run a batch of environments, stepped by one compiled program.
 
     An environment whose episode ends starts the next one in the same step (``AutoresetMode.SAME_STEP``): the true last
-    observation is in ``infos["final_obs"]``, what the last step has to tell in ``infos["final_info"]``. Physics that is
+    observation is in ``infos["final_obs"]``, the last step's info in ``infos["final_info"]``. Physics that is
     no longer finite truncates, as in ``TaskGymEnv``, whose arguments are the same.
 
     Args:
@@ -166,7 +163,7 @@ class TaskVectorEnv(_Backed, gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Fresh episodes everywhere: observations float32[N, obs] and infos.
+        """Return fresh episodes everywhere: observations float32[N, obs] and infos.
 
         Args:
             seed: one number, for all; see ``TaskGymEnv.reset``.
@@ -181,14 +178,14 @@ class TaskVectorEnv(_Backed, gymnasium.vector.VectorEnv):
         return np.array(self._state.obs), {"success": np.zeros(self.num_envs, bool), "_success": self._everywhere()}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One control step under ``actions[N, act]``: observations, rewards, terminations, truncations, infos.
+        """Return observations, rewards, terminations, truncations, infos of one control step under ``actions[N, act]``.
 
         Raises:
             ValueError: the actions' shape is wrong or they are not finite.
         """
-        state = _started(self._state)
-        self._state, out = self._programs.auto_step(state, _checked(actions, self.action_space))
-        out = _to_numpy(out)
+        state = started(self._state)
+        self._state, out = self._programs.auto_step(state, checked(actions, self.action_space))
+        out = to_numpy(out)
         done = out.terminated | out.truncated
         # As gymnasium's own vector environments: where an episode has ended, infos are those of the new one's reset.
         infos: dict[str, Any] = {"success": out.success & ~done, "_success": self._everywhere()}
@@ -205,117 +202,18 @@ class TaskVectorEnv(_Backed, gymnasium.vector.VectorEnv):
         return out.obs, out.reward, out.terminated, out.truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Every environment's state as uint8[height, width, 3]; None without a render mode."""
+        """Return every environment's state as uint8[height, width, 3]; None without a render mode."""
         return self._frames()
 
     def close_extras(self) -> None:
-        """Gives the OpenGL context back."""
+        """Give the OpenGL context back."""
         self._release()
 
     def _everywhere(self) -> np.ndarray:
         return np.ones(self.num_envs, bool)
 
 
-class _Outcome(NamedTuple):
-    """What one control step brought; leading axis N. ``obs`` is after the reset where there was one."""
-
-    obs: Any
-    final_obs: Any
-    reward: Any
-    terminated: Any
-    truncated: Any
-    success: Any
-
-
-_Step = Callable[[State, np.ndarray], tuple[State, _Outcome]]
-
-
-class _Programs(NamedTuple):
-    """The compiled parts of one task on one engine, shared by all environments of it; batched.
-
-    Attributes:
-        task: the environment.
-        spaces: of observations and of actions.
-        start: (random numbers, N, options) -> states.
-        step: leaves ended episodes as they are.
-        auto_step: starts the next episodes.
-    """
-
-    task: TaskEnv
-    spaces: tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]
-    start: Callable[[np.random.Generator, int, Mapping[str, Any] | None], State]
-    step: _Step
-    auto_step: _Step
-
-
-@functools.cache
-def _programs(full_name: str, physics: str) -> _Programs:
-    # Must be said before jax is first used: MuJoCo C is called back from compiled programs, and with asynchronous
-    # dispatch on a CPU such a callback can wait for ever on arrays that wait for it (jax issue 25861).
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
-    task = make(full_name, physics=physics)
-    auto = AutoReset(task)
-    limits = np.full(task.observation_size, np.inf, np.float32)
-    spaces = (
-        gymnasium.spaces.Box(-limits, limits),
-        gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32),
-    )
-    known = [name for name in inspect.signature(task.reset).parameters if name not in ("rng", "key")]
-
-    def start_plainly(key: jax.Array, num_envs: int, options: Mapping[str, Any]) -> State:
-        keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(num_envs))
-        return jax.vmap(lambda key: auto.reset(key, **options))(keys)
-
-    start_compiled = jax.jit(functools.partial(start_plainly, options={}), static_argnames="num_envs")
-
-    def start(random: np.random.Generator, num_envs: int, options: Mapping[str, Any] | None) -> State:
-        key = jax.random.key(int(random.integers(2**32)))
-        if not options:
-            return start_compiled(key, num_envs)
-        for name in options:
-            if name not in known:
-                raise ValueError(f"{full_name} has no reset option {name!r}; options: {', '.join(known) or 'none'}")
-        return start_plainly(key, num_envs, options)
-
-    def step(env: TaskEnv | AutoReset, state: State, actions: jax.Array) -> tuple[State, _Outcome]:
-        after = jax.vmap(env.step)(state, actions)
-        truncated = after.info["truncation"] > 0
-        terminated = (after.done > 0) & ~truncated
-        success = after.metrics["success"] > 0
-        return after, _Outcome(after.obs, after.info["final_obs"], after.reward, terminated, truncated, success)
-
-    return _Programs(
-        task, spaces, start, jax.jit(functools.partial(step, task)), jax.jit(functools.partial(step, auto))
-    )
-
-
-def _checked(actions: Any, space: gymnasium.Space) -> np.ndarray:
-    """The actions as float32.
-
-    Raises:
-        ValueError: they are not of ``space.shape`` or not finite.
-    """
-    array = np.asarray(actions, np.float32)
-    if array.shape != space.shape:
-        raise ValueError(f"actions have the shape {array.shape}; this environment takes {space.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError("actions are not finite; look at the policy that gave them")
-    return array
-
-
-def _to_numpy(out: _Outcome) -> _Outcome:
-    """Copies that a caller may keep and change; rewards in float64, as gymnasium has them."""
-    arrays = _Outcome(*(np.array(value) for value in jax.device_get(out)))
-    return arrays._replace(reward=arrays.reward.astype(np.float64))
-
-
-def _started(state: State | None) -> State:
-    if state is None:
-        raise ValueError("the environment has no state yet; call reset() first")
-    return state
-
-
-def _renderer(task: TaskEnv, render_mode: str | None, frames: Mapping[str, Any]) -> Renderer | None:
+def _renderer(task: Task, render_mode: str | None, frames: Mapping[str, Any]) -> Renderer | None:
     if render_mode is None:
         return None
     if render_mode not in _METADATA["render_modes"]:
@@ -323,15 +221,17 @@ def _renderer(task: TaskEnv, render_mode: str | None, frames: Mapping[str, Any])
     return Renderer(task, **frames)
 
 
-def _register() -> None:
+def register_tasks() -> None:
+    """Register with Gymnasium every task that is not yet; for families that were added after the import."""
     names = {spec.full_name for spec in list_tasks()} | {spec.name for spec in list_tasks()}
     for name in sorted(names):
-        gymnasium.register(
-            f"qdos/{name}-v0",
-            entry_point=f"{__name__}:TaskGymEnv",
-            vector_entry_point=f"{__name__}:TaskVectorEnv",
-            kwargs={"task": name},
-        )
+        if f"qdos/{name}-v0" not in gymnasium.registry:
+            gymnasium.register(
+                f"qdos/{name}-v0",
+                entry_point=f"{__name__}:TaskGymEnv",
+                vector_entry_point=f"{__name__}:TaskVectorEnv",
+                kwargs={"task": name},
+            )
 
 
-_register()
+register_tasks()

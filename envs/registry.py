@@ -1,36 +1,52 @@
-"""Names of tasks: listing, aliases, making."""
+"""Register families of tasks, list their tasks and make them by name."""
 
 from __future__ import annotations
 
 import difflib
 import importlib
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from envs.families import FAMILIES, TaskSpec
+from envs.families import Family, TaskSpec
+from envs.mazes.families import MAZE_FAMILIES
 
 if TYPE_CHECKING:
-    from envs.task import TaskEnv
+    from envs.task import Task
 
-ALIASES = {
-    "antmaze": "antmaze-large",
-    "antsoccer": "antsoccer-arena",
-    "humanoidmaze": "humanoidmaze-medium",
-}
+FAMILIES: dict[str, Family] = {}
+ALIASES: dict[str, str] = {}
+"""What the name of a family alone stands for."""
+
+
+def register_family(name: str, family: Family) -> None:
+    """Make the tasks of ``family`` known under ``name``, the first word of their names.
+
+    Raises:
+        ValueError: another family has that name, the name is no single word, or the default variant is unknown.
+    """
+    if not re.fullmatch(r"[a-z0-9]+", name):
+        raise ValueError(f"a family's name is one word of a-z and 0-9, not {name!r}")
+    if name in FAMILIES:
+        raise ValueError(f"there is already a family {name!r}")
+    if family.default_variant not in family.variants:
+        raise ValueError(f"family {name!r} has no variant {family.default_variant!r} to take by default")
+    FAMILIES[name] = family
+    if family.default_variant:
+        ALIASES[name] = f"{name}-{family.default_variant}"
 
 
 def list_tasks() -> list[TaskSpec]:
-    """Every task, family by family."""
+    """Return every task, family by family."""
     return [
-        TaskSpec(f"{name}-{maze}", name, maze, task_id, family.episode_lengths[maze])
+        TaskSpec(name, key, task_id, variant.episode_length)
         for name, family in FAMILIES.items()
-        for maze, tasks in family.tasks.items()
-        for task_id in range(1, len(tasks) + 1)
+        for key, variant in family.variants.items()
+        for task_id in range(1, variant.num_tasks + 1)
     ]
 
 
 def get_spec(name: str) -> TaskSpec:
-    """The task called ``name``: an alias or a name, with or without "-taskN".
+    """Return the task called ``name``: an alias or a name, with or without "-taskN".
 
     Raises:
         ValueError: there is no such task; the message proposes the nearest.
@@ -49,8 +65,8 @@ def get_spec(name: str) -> TaskSpec:
     raise ValueError(f"there is no task {name!r}; did you mean {near!r}? (tasks: {', '.join(known[: -len(specs)])})")
 
 
-def make(name: str, physics: str = "auto") -> TaskEnv:
-    """The environment called ``name``.
+def make(name: str, physics: str = "auto") -> Task:
+    """Return the environment called ``name``.
 
     Args:
         name: as "antmaze-large", "antmaze-large-task2" or an alias.
@@ -65,5 +81,16 @@ def make(name: str, physics: str = "auto") -> TaskEnv:
     from envs.physics import resolve_physics  # here and below, for physics loads jax and MuJoCo, and listing does not
 
     engine = resolve_physics(physics, family.engines)
-    module, _, class_name = family.env_class.partition(":")
-    return getattr(importlib.import_module(module), class_name)(spec, engine)
+    return _load(family.make)(spec, engine)
+
+
+def _load(make: Any) -> Any:
+    """Return what makes a family's environments, imported where it is given by name."""
+    if not isinstance(make, str):
+        return make
+    module, _, name = make.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+for _name, _family in MAZE_FAMILIES.items():
+    register_family(_name, _family)

@@ -1,4 +1,4 @@
-"""Frames of any state, drawn offscreen by MuJoCo's renderer.
+"""Draw frames of any state offscreen, with MuJoCo's renderer.
 
 MuJoCo for Python settles on a way to OpenGL when it is first imported, from ``MUJOCO_GL``, and on a Linux machine
 without a display its default cannot work. So the contexts are opened here, when the first frame is wanted: the one that
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-import math
 import os
 import subprocess
 import sys
@@ -21,14 +20,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from envs.locomotion import BodyEnv
-from envs.maze import UNIT, WALL_HALF_SIZE, Maze
-
-CAMERAS = ("top", "follow")
+from envs.task import Task
 
 _HEADLESS = ("egl", "osmesa")  # ways to OpenGL that need no display
 _BY_MUJOCO_GL = {"egl": "egl", "osmesa": "osmesa"} | dict.fromkeys(("glfw", "glx", "on", "true", "1", "enable"), "glfw")
-_MEND = (
+_REMEDY = (
     "install EGL (Debian, Ubuntu: apt-get install libegl1 libgl1) or OSMesa (libosmesa6), "
     "or name a way that works with MUJOCO_GL=egl, osmesa or glfw"
 )
@@ -40,56 +36,59 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 """
 _PROBE_SECONDS = 60
 _MAX_GEOMS = 2000  # the largest maze has 124 walls; MuJoCo adds a few of its own
-_BODY = 1  # the first body after the world: the one that walks
 
 
 class NoOpenGL(RuntimeError):
-    """No way to OpenGL on this machine; the message is one line with causes and mend."""
+    """Report that nothing draws on this machine; the message is one line with causes and remedy."""
 
 
 class Renderer:
-    """Draws states of a task; a context manager that gives its OpenGL context back.
+    """Draw states of a task; a context manager that gives its OpenGL context back.
 
     Args:
-        env: the task, on either engine, wrapped or not; always the whole maze is drawn.
+        env: the task, on any engine, wrapped or not.
         height: of the frames, in pixels.
-        width: of the frames, in pixels; None takes the maze's own shape, to a multiple of 16, which films want.
-        camera: "top": the whole maze from above, x to the right and y up; "follow": the body from near by.
+        width: of the frames, in pixels; None takes the scene's own shape, to a multiple of 16, which films want.
+        camera: one of the scene's, such as "top" or "follow" in a maze; None takes its first.
 
     Raises:
         ValueError: there is no such camera, or the frame has no pixels.
         NoOpenGL: this machine cannot draw.
     """
 
-    def __init__(self, env: BodyEnv, height: int = 480, width: int | None = None, camera: str = "top") -> None:
-        if camera not in CAMERAS:
-            raise ValueError(f"there is no camera {camera!r}; cameras: {', '.join(CAMERAS)}")
+    def __init__(self, env: Task, height: int = 480, width: int | None = None, camera: str | None = None) -> None:
+        scene = env.scene()
+        camera = next(iter(scene.cameras)) if camera is None else camera
+        if camera not in scene.cameras:
+            raise ValueError(f"there is no camera {camera!r}; cameras: {', '.join(scene.cameras)}")
         if width is None:
-            rows, columns = env.layout.grid.shape
-            width = 16 * round(height * columns / rows / 16)
+            width = 16 * round(height * scene.aspect / 16)
         if height < 1 or width < 1:
             raise ValueError(f"a frame of {height} x {width} has no pixels; height and width start at 1")
-        self._model = env.whole_model()  # of its own, for it is changed below and in every frame
+        self._model = scene.model
+        self._goal_marker = scene.goal_marker
+        if scene.goal_marker is not None:  # MuJoCo ignores the place of a geom that was compiled at its body's
+            self._model.geom_sameframe[self._model.geom(scene.goal_marker).id] = 0
         self._model.vis.global_.offheight = height
         self._model.vis.global_.offwidth = width
         self._data = mujoco.MjData(self._model)
         self.height, self.width = height, width
-        fovy = self._model.vis.global_.fovy
-        self._camera = _top_camera(env.layout, fovy, width / height) if camera == "top" else _follow_camera()
+        self._camera = scene.cameras[camera](self._model, width / height)
         self._scene = mujoco.MjvScene(self._model, _MAX_GEOMS)
         # The light comes from straight above, where its shadows tell little; in software they are 3/4 of the work.
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._options = mujoco.MjvOption()
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self._gl, self._context = _open_contexts(self._model, height, width)
-        self._free = weakref.finalize(self, _free, self._gl, self._context)  # for who forgets to close it
+        self._free = weakref.finalize(self, _free, self._gl, self._context)  # where close() was forgotten
 
-    def frame(self, qpos: Any, goal_xy: Any) -> np.ndarray:
-        """uint8[height, width, 3], the state ``qpos[nq]`` with the target at ``goal_xy[2]``."""
+    def frame(self, qpos: Any, goal: Any) -> np.ndarray:
+        """Return uint8[height, width, 3], the state ``qpos[nq]`` with the mark of the goal, if any, at ``goal``."""
         if not self._free.alive:
             raise ValueError("this renderer is closed; make a new one")
         self._data.qpos[:] = np.asarray(qpos)
-        self._model.geom("target").pos[:2] = np.asarray(goal_xy)
+        if self._goal_marker is not None:
+            self._model.geom(self._goal_marker).pos[: len(goal)] = np.asarray(goal)
         mujoco.mj_forward(self._model, self._data)
         mujoco.mjv_updateScene(
             self._model, self._data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
@@ -101,7 +100,7 @@ class Renderer:
         return image[::-1].copy()  # OpenGL counts rows from below
 
     def close(self) -> None:
-        """Gives the OpenGL context back; a second time does nothing."""
+        """Give the OpenGL context back; a second time does nothing."""
         self._free()
 
     def __enter__(self) -> Renderer:
@@ -114,37 +113,12 @@ class Renderer:
 
 
 def steps_per_second(env: Any) -> float:
-    """Control steps per simulated second: the frame rate at which a film of every step runs in real time."""
+    """Return the control steps per simulated second: the frame rate at which a film of every step runs in real time."""
     return 1.0 / (env.engine.frame_skip * env.engine.model.opt.timestep)
 
 
-def _top_camera(layout: Maze, fovy: float, aspect: float) -> mujoco.MjvCamera:
-    """Straight above the middle, as high as it takes to see every wall.
-
-    Args:
-        layout: the maze.
-        fovy: vertical field of view in degrees.
-        aspect: width / height of the picture.
-    """
-    rows, columns = layout.grid.shape
-    half_y, half_x = rows * UNIT / 2, columns * UNIT / 2
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = (*layout.ij_to_xy(((rows - 1) / 2, (columns - 1) / 2)), 0.0)
-    camera.azimuth, camera.elevation = 90.0, -90.0
-    camera.distance = max(half_y, half_x / aspect) / math.tan(math.radians(fovy) / 2) + 2 * WALL_HALF_SIZE[2]
-    return camera
-
-
-def _follow_camera() -> mujoco.MjvCamera:
-    camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-    camera.trackbodyid = _BODY
-    camera.azimuth, camera.elevation, camera.distance = 90.0, -50.0, 10.0
-    return camera
-
-
 def _open_contexts(model: mujoco.MjModel, height: int, width: int) -> tuple[Any, mujoco.MjrContext]:
-    """An OpenGL context, and in it the renderer's.
+    """Return an OpenGL context, and in it the renderer's.
 
     Raises:
         NoOpenGL: no way works.
@@ -160,14 +134,14 @@ def _open_contexts(model: mujoco.MjModel, height: int, width: int) -> tuple[Any,
             gl.make_current()
             context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     except Exception as error:  # each library fails in its own way: ImportError, AttributeError, GLError ..
-        raise NoOpenGL(f"cannot draw with {way} ({_one_line(str(error))}); {_MEND}") from error
+        raise NoOpenGL(f"cannot draw with {way} ({_one_line(str(error))}); {_REMEDY}") from error
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
     return gl, context
 
 
 @functools.cache
 def _headless_way() -> str:
-    """The first of EGL and OSMesa that works on this machine.
+    """Return the first of EGL and OSMesa that works on this machine.
 
     Each is tried in a process of its own, for a library that failed stays loaded, and MuJoCo would ask it for the
     functions of the next one's context.
@@ -186,11 +160,11 @@ def _headless_way() -> str:
         if done.returncode == 0:
             return way
         causes.append(f"{way}: {_one_line(done.stderr) or f'exit code {done.returncode}'}")
-    raise NoOpenGL(f"cannot draw without OpenGL ({'; '.join(causes)}); {_MEND}")
+    raise NoOpenGL(f"cannot draw without OpenGL ({'; '.join(causes)}); {_REMEDY}")
 
 
 def _one_line(message: str) -> str:
-    """The last line of an error's text."""
+    """Return the last line of an error's text."""
     return next(reversed(message.strip().splitlines()), "")
 
 

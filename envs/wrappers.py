@@ -1,4 +1,4 @@
-"""What learners put around a task."""
+"""Wrap a task for learners."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from envs.brax_base import Env, State
 
 
 class AutoReset(Env):
-    """Starts the next episode inside the step that ends one.
+    """Start the next episode inside the step that ends one.
 
     After a step with ``done``, ``obs``, ``pipeline_state`` and the episode's ``info`` are of a fresh reset, drawn from
-    a key that is never used twice, while reward, done, ``metrics`` and ``info["truncation"]`` tell of the ended episode
+    a key that is never used twice, while reward, done, ``metrics`` and ``info["truncation"]`` are of the ended episode
     and ``info["final_obs"]`` is its true last observation.
 
     Physics that is no longer finite ends the episode too: ``metrics["nan"]`` is 1, the episode counts as truncated and
@@ -34,34 +34,38 @@ class AutoReset(Env):
 
     @property
     def observation_size(self) -> int:
+        """Return the numbers per observation."""
         return self.env.observation_size
 
     @property
     def action_size(self) -> int:
+        """Return the numbers per action."""
         return self.env.action_size
 
     @property
     def backend(self) -> str:
+        """Return the engine's name."""
         return self.env.backend
 
     @property
     def unwrapped(self) -> Env:
+        """Return the task."""
         return self.env.unwrapped
 
-    def reset(self, rng: jax.Array, **cells: Any) -> State:
-        """The first episode's start; ``rng`` is a typed key.
+    def reset(self, rng: jax.Array, **options: Any) -> State:
+        """Return the first episode's start; ``rng`` is a typed key.
 
-        ``cells`` (``start_ij``, ``goal_ij``, ``ball_ij``) go to the task's reset and hold for this episode alone: those
-        that follow have the task's own cells.
+        ``options`` (a maze's ``start_ij``, ``goal_ij``, ``ball_ij``) go to the task's reset and hold for this episode
+        alone: those that follow start as the task does.
         """
-        return _with_nan_count(self.env.reset(rng, **cells))
+        return _with_nan_count(self.env.reset(rng, **options))
 
     def reset_to(self, *args: Any, **kwargs: Any) -> State:
-        """As the task's ``reset_to``."""
+        """Return the state that the task's ``reset_to`` makes."""
         return _with_nan_count(self.env.reset_to(*args, **kwargs))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """One control step, and the reset where it ends the episode."""
+        """Return the state after one control step, and after the reset where it ends the episode."""
         after = self.env.step(state, action)
         bad = ~_is_finite((after.pipeline_state.qpos, after.pipeline_state.qvel, after.obs, after.reward))
         done = bad | (after.done > 0)
@@ -85,7 +89,7 @@ class AutoReset(Env):
 
 
 def _when_any(reset: Callable[[jax.Array], State]) -> Callable[[jax.Array, jax.Array], State]:
-    """``reset`` as a function of (wanted, key) that is skipped, and gives zeros, unless some of the batch want it.
+    """Return ``reset`` as a function of (wanted, key) that is skipped, and gives zeros, unless some of a batch want it.
 
     Few steps end an episode, and a reset can cost as much as a step. Under ``vmap`` an ordinary ``cond`` would compute
     both branches; here the batch decides together, through any number of axes.
@@ -112,7 +116,7 @@ def _when_any(reset: Callable[[jax.Array], State]) -> Callable[[jax.Array, jax.A
 
 
 def _blank(leaf: jax.ShapeDtypeStruct, key: jax.Array) -> jax.Array:
-    """Zeros, or where a key is wanted, the one at hand."""
+    """Return zeros, or where a key is wanted, the one at hand."""
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return jnp.broadcast_to(key, leaf.shape)
     return jnp.zeros(leaf.shape, leaf.dtype)

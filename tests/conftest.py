@@ -39,7 +39,7 @@ def opengl() -> None:
 @pytest.fixture
 def finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run folder of two members, with everything that an evaluation reads; episodes are cut short."""
-    monkeypatch.setattr(envs.TaskEnv, "episode_length", 25)
+    monkeypatch.setattr(envs.Task, "episode_length", 25)
     given = {"seed": (0, 1), "physics": "mujoco", "skills.horizon": 10}
     config = configs.load_config("antmaze-medium", "smoke", given, [])
     env, high = envs.make(config.env, physics="mujoco"), config.high_level

@@ -31,11 +31,12 @@ class PointEnv(Env):
     action_size = 2
     episode_length = 60
     backend = "toy"
+    extra_size = 0
 
     def reset(self, rng):
         return self.reset_to(0.1 * jax.random.normal(rng, (2,)), jnp.zeros(2), GOAL, rng)
 
-    def reset_to(self, qpos, qvel, goal_xy=None, key=None):
+    def reset_to(self, qpos, qvel, goal=None, key=None, extra=None):
         obs = qpos
         info = {
             "truncation": jnp.zeros(()),

@@ -1,4 +1,4 @@
-"""One control step of physics: engines behind one interface."""
+"""Choose an engine: each makes control steps of physics behind one interface."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import jax
 
 from envs.physics.base import Engine, PipelineState, Sensors
-from envs.physics.mujoco_engine import MujocoEngine
+from envs.physics.mujoco.engine import MujocoEngine
 
 __all__ = ["ENGINES", "Engine", "MujocoEngine", "PipelineState", "Sensors", "resolve_physics", "why_not"]
 
@@ -16,7 +16,7 @@ ENGINES = ("mjx", "mjx-warp", "mujoco")
 
 
 def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
-    """The engine's name; "auto" takes MuJoCo C, beside an accelerator too.
+    """Return the engine's name; "auto" takes MuJoCo C, beside an accelerator too.
 
     With 64 environments 16 cores make 15 times the steps of MJX on an H200; MJX passes them near 2,000 (interpolated),
     more than a run here steps at a time (results/physics-gpu.json).
@@ -42,7 +42,7 @@ def resolve_physics(physics: str, supported: Sequence[str] = ENGINES) -> str:
 
 
 def why_not(physics: str) -> str:
-    """Why this machine cannot run the engine, and what mends that; empty where it can."""
+    """Return why this machine cannot run the engine, and the remedy; empty where it can."""
     if physics != "mjx-warp":
         return ""
     if importlib.util.find_spec("warp") is None:

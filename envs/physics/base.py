@@ -1,4 +1,4 @@
-"""What an engine is to the tasks: one control step of one body, batched by ``jax.vmap``."""
+"""Define what an engine is to the tasks: one control step of one simulation, batched by ``jax.vmap``."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ from flax import struct
 
 
 class PipelineState(struct.PyTreeNode):
-    """The simulator's state between two control steps.
+    """Hold the simulator's state between two control steps.
 
     Attributes:
         qpos: float32[nq], generalised positions (units: metres, radians, unit quaternions).
         qvel: float32[nv], generalised velocities.
-        sensed: float32[k], what the body observes besides qpos and qvel (``Sensors``), of this very state; k is 0 for
-            most bodies.
+        sensed: float32[k], what the task observes besides qpos and qvel, of this very state; k is 0 for most tasks.
+        extra: int32[e], discrete state that the physics does not know, such as buttons; e is 0 for most tasks.
         carry: whatever the engine needs to go on exactly as if it had never stopped (warm start, float64 bits).
     """
 
     qpos: jax.Array
     qvel: jax.Array
     sensed: jax.Array
+    extra: jax.Array
     carry: Any
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """What a body senses of its own posture, as DeepMind Control's humanoid does.
+    """Read what a body senses of its own posture, as DeepMind Control's humanoid does.
 
     Attributes:
         root: the body in whose frame the limbs are seen.
@@ -47,11 +48,11 @@ class Sensors:
 
     @property
     def size(self) -> int:
-        """Numbers per state: heights, limbs, the root's uprightness, the velocity."""
+        """Return the numbers per state: heights, limbs, the root's uprightness, the velocity."""
         return len(self.heights) + 3 * len(self.limbs) + 6
 
     def read(self, model: mujoco.MjModel, xpos: Any, xmat: Any, sensordata: Any) -> Any:
-        """The numbers [..., size] of states after a forward pass; NumPy in, NumPy out, jax likewise.
+        """Return the numbers [..., size] of states after a forward pass; NumPy in, NumPy out, jax likewise.
 
         Args:
             model: names bodies and sensors.
@@ -70,22 +71,34 @@ class Sensors:
 
 
 class Engine(Protocol):
-    """One control step behind one interface; MJX and MuJoCo C implement it."""
+    """Make control steps; MJX and MuJoCo C implement it.
+
+    Attributes:
+        name: "mujoco", "mjx" or "mjx-warp".
+        model: what is stepped.
+        frame_skip: sub-steps per control step.
+        nq: size of qpos.
+        nv: size of qvel.
+        action_size: numbers per action.
+        extra_size: size of the discrete state.
+    """
 
     name: str
     model: mujoco.MjModel
     frame_skip: int
     nq: int
     nv: int
-    nu: int
+    action_size: int
+    extra_size: int
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
-        """The state at (qpos[nq], qvel[nv]), with no warm start."""
+    def init(self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None) -> PipelineState:
+        """Return the state at (qpos[nq], qvel[nv], extra[e]), with no warm start; None takes zeros as ``extra``."""
         ...
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
-        """One control step (``frame_skip`` sub-steps) under a constant ``action[nu]``.
+        """Return the state after one control step (``frame_skip`` sub-steps) under ``action[act]``.
 
-        Goes on from what ``state.qpos`` and ``state.qvel`` say, also where they were changed since the last step.
+        Starts from ``state.qpos``, ``state.qvel`` and ``state.extra``, also where they were changed since the last
+        step.
         """
         ...

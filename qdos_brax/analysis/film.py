@@ -39,7 +39,7 @@ def film_run(run: Path, out: Path, height: int = 480) -> dict[str, float]:
         raise UserError(str(error)) from error
     with renderer, mp4(out, renderer.height, renderer.width, steps_per_second(env)) as write:
         for state, _ in Player(trained).episode(0):
-            write(renderer.frame(state.pipeline_state.qpos, state.info["goal_xy"]))
+            write(renderer.frame(state.pipeline_state.qpos, state.info["goal"]))
             length += 1
             episode_return += float(state.reward) if length else 0.0
     return {"success": float(state.metrics["success"]), "return": episode_return, "length": length}

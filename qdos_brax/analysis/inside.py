@@ -117,8 +117,10 @@ def _first_seeds(trained: TrainedRun) -> list[int]:
 
 
 def _place(env: Any) -> Arrays:
-    cells = np.argwhere(env.layout.grid == 1)
-    return {"goal": np.asarray(env.goal_xy, np.float32), "walls": np.asarray(env.layout.ij_to_xy(cells), np.float32)}
+    floor = env.floor_map()
+    if floor is None:
+        return {}
+    return {"goal": np.asarray(floor.goal, np.float32), "walls": np.asarray(floor.walls, np.float32)}
 
 
 # --- Segments --------------------------------------------------------------------------------------------------
@@ -130,7 +132,8 @@ def _truth(trained: TrainedRun, sample: _Sample) -> Arrays:
     found: Arrays = {"return": dataset.rewards[starts[:, None] + np.arange(horizon)].sum(axis=1)}
     if dataset.qpos is not None:
         gain = quality.progress(trained.env, dataset, starts, horizon)
-        found["gain"] = np.where(np.isfinite(gain), gain, np.nan).astype(np.float32)
+        if gain is not None:
+            found["gain"] = np.where(np.isfinite(gain), gain, np.nan).astype(np.float32)
     if dataset.quality is not None:
         found["quality"] = dataset.quality[starts]
         found["quality_names"] = np.asarray(sorted(quality.QUALITY, key=quality.QUALITY.__getitem__))
@@ -174,6 +177,8 @@ class _LatentView:
         found: Arrays = {"latent": latents}
         if len(latents) > _GRID:
             found["tsne"] = _tsne(latents)
+        if self._trained.env.floor_map() is None:
+            return found
         grid, between = _grid(latents), _between(latents)
         paths = np.asarray(self._play(artifacts, hyper, np.concatenate([grid, between])), np.float32)
         return found | {"grid": paths[: len(grid)], "between": paths[len(grid) :]}
@@ -184,11 +189,16 @@ class _LatentView:
 
         def step(state: Any, _: None) -> tuple[Any, jax.Array]:
             state = env.step(state, agent.play(state.obs, latent))
-            return state, state.pipeline_state.qpos[:2]
+            return state, _place_of_body(env, state.pipeline_state.qpos)
 
         start = env.reset(evaluation_key())
         _, path = jax.lax.scan(step, start, None, self._steps)
-        return jnp.concatenate([start.pipeline_state.qpos[None, :2], path])
+        return jnp.concatenate([_place_of_body(env, start.pipeline_state.qpos)[None], path])
+
+
+def _place_of_body(env: Any, qpos: Any) -> Any:
+    """Return [..., 2], where what acts is, of a task that has positions."""
+    return next(iter(env.position(qpos).values()))
 
 
 def _tsne(latents: np.ndarray) -> np.ndarray:
@@ -225,19 +235,24 @@ def _between(latents: np.ndarray) -> np.ndarray:
 
 
 def _episode(trained: TrainedRun, player: Player, member: int) -> Arrays:
-    states: list[tuple[np.ndarray, np.ndarray]] = []
+    states: list[tuple[np.ndarray, ...]] = []
     latents: list[np.ndarray] = []
     for state, latent in player.episode(member):
         if latent is not None and (len(states) - 1) % trained.config.skills.horizon == 0:
             latents.append(np.asarray(latent))
-        states.append((np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal_xy"])))
-    qpos = np.stack([q for q, _ in states])
-    left = np.asarray(trained.env.true_distance(qpos), np.float32)
-    found: Arrays = {"path": qpos[:, :2].astype(np.float32), "left": left, "latents": np.stack(latents)}
+        physics = state.pipeline_state
+        states.append(tuple(map(np.asarray, (physics.qpos, state.info["goal"], physics.extra))))
+    qpos, _, extra = map(np.stack, zip(*states, strict=True))
+    found: Arrays = {"latents": np.stack(latents)}
+    left = trained.env.distance_left(qpos, extra)
+    if left is not None:
+        found["left"] = np.asarray(left, np.float32)
+    if trained.env.floor_map() is not None:
+        found["path"] = _place_of_body(trained.env, qpos).astype(np.float32)
     steps = np.unique(np.linspace(0, len(states) - 1, _FRAMES).round().astype(int))
     try:
         with Renderer(trained.env, _FRAME_HEIGHT) as renderer:
-            found["frames"] = np.stack([renderer.frame(*states[step]) for step in steps])
+            found["frames"] = np.stack([renderer.frame(*states[step][:2]) for step in steps])
             found["frame_steps"] = steps
     except NoOpenGL:  # a page without frames is better than none
         pass

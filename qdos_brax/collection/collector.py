@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.soccer import BALL_QPOS
-from envs.task import TaskEnv
+from envs.mazes.maze_task import MazeTask
+from envs.mazes.soccer import BALL_QPOS
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.steering import approach, dribble_direction, maze_direction
 from qdos_brax.collection.experts.views import random_direction
@@ -39,7 +39,7 @@ class Collector:
         UserError: no expert is shipped for the body.
     """
 
-    def __init__(self, env: TaskEnv, recipe: CollectionRecipe, expert: policies.Expert | None = None) -> None:
+    def __init__(self, env: MazeTask, recipe: CollectionRecipe, expert: policies.Expert | None = None) -> None:
         self.env, self.recipe, self.profile = env, recipe, profile_of(env)
         self.expert = expert or self.profile.expert()
         self._dribbler = self.expert if isinstance(self.expert, policies.DribblingExpert) else None

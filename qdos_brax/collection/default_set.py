@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 import qdos_brax
-from envs.task import TaskEnv
+from envs.mazes.maze_task import MazeTask
 from qdos_brax.collection import recipes
 from qdos_brax.collection.collect import COLLECTION_VERSION, check_size, collect
 from qdos_brax.collection.collector import Collector
@@ -24,7 +24,7 @@ from qdos_brax.data.quality import QUALITY
 
 
 def default_dataset(
-    env: TaskEnv, transitions: int, degraded_share: float, noise: float, seed: int, num_envs: int = 64
+    env: MazeTask, transitions: int, degraded_share: float, noise: float, seed: int, num_envs: int = 64
 ) -> Path:
     """Return the path of the set with these parameters; collect it if it does not exist.
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from envs.mazes.maze_task import GOAL_TOLERANCE, START_NOISE, MazeTask
+from envs.mazes.soccer import BALL_QPOS
 from envs.render import steps_per_second
-from envs.soccer import BALL_QPOS
-from envs.task import GOAL_TOLERANCE, START_NOISE, TaskEnv
 from qdos_brax.collection.experts.steering import Navigator
 from qdos_brax.collection.experts.views import random_direction
 from qdos_brax.collection.recipes import CollectionRecipe
@@ -38,7 +38,7 @@ class Planner:
         navigator: the maze's shortest paths.
     """
 
-    def __init__(self, env: TaskEnv, recipe: CollectionRecipe, has_dribbler: bool) -> None:
+    def __init__(self, env: MazeTask, recipe: CollectionRecipe, has_dribbler: bool) -> None:
         self.recipe, self.has_dribbler = recipe, has_dribbler
         self.navigator = Navigator(env.layout)
         self._action_size = env.action_size

@@ -9,7 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from envs.task import RESET_NOISE, TaskEnv
+from envs.mazes.maze_task import RESET_NOISE, MazeTask
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.poses import humanoid_is_up, standing_humanoid
 from qdos_brax.errors import UserError
@@ -36,13 +36,13 @@ class CollectionProfile:
     """
 
     expert: Callable[[], policies.Expert]
-    start: Callable[[TaskEnv, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+    start: Callable[[MazeTask, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
     has_fallen: Callable[[jax.Array], jax.Array] | None
     heavy_noise: float
     stitch_steps: int
 
 
-def profile_of(env: TaskEnv) -> CollectionProfile:
+def profile_of(env: MazeTask) -> CollectionProfile:
     """Return the profile of the task's body.
 
     Raises:
@@ -56,12 +56,12 @@ def profile_of(env: TaskEnv) -> CollectionProfile:
     return PROFILES[env.spec.family]
 
 
-def _task_start(env: TaskEnv, ahead: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _task_start(env: MazeTask, ahead: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     start = env.reset(key).pipeline_state
     return start.qpos, start.qvel
 
 
-def _standing_start(env: TaskEnv, ahead: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _standing_start(env: MazeTask, ahead: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return a standing state that faces its way, roughly: the task's own reset drops the body, which cannot get up."""
     pose_key, yaw_key, qvel_key = jax.random.split(key, 3)
     yaw = jnp.arctan2(ahead[1], ahead[0]) + YAW_NOISE * jax.random.normal(yaw_key)

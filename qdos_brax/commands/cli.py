@@ -297,7 +297,8 @@ def _tasks(args: argparse.Namespace) -> int:
     for name, count in counts.items():
         default = envs.get_spec(name)
         family = envs.FAMILIES[default.family]
-        sizes = map(str, (family.observation_size, family.action_size, default.episode_length))
+        variant = family.variants[default.variant]
+        sizes = map(str, (variant.observation_size, variant.action_size, variant.episode_length))
         variants = [f"task1 to task{count}", f"task{default.task_id}", aliases.get(name, "")]
         rows.append([name, *sizes, ", ".join(family.engines), *variants])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

@@ -92,7 +92,7 @@ def _make(args: argparse.Namespace) -> int:
     return 0
 
 
-def _recipe(args: argparse.Namespace, env: envs.TaskEnv) -> recipes.CollectionRecipe:
+def _recipe(args: argparse.Namespace, env: envs.Task) -> recipes.CollectionRecipe:
     body = profile_of(env)
     if args.recipe != "mixed":
         if args.mix is not None or args.degraded_share is not None:
@@ -155,7 +155,7 @@ def _check(args: argparse.Namespace) -> int:
         raise UserError(f"--horizon must be at least 1, got {args.horizon}")
     env = _env(args.env, "mujoco")
     path = download.resolve(args.file)
-    rows = formats.load(path)
+    rows = formats.load(path, env.jump)
     found = checks.inspect(rows, env, args.horizon, formats.read_attrs(path))
     for line in found.errors:
         print(f"error: {line}")
@@ -173,7 +173,7 @@ def _check(args: argparse.Namespace) -> int:
     return 0
 
 
-def _draw_map(out: str, rows: Rows, env: envs.TaskEnv, title: str) -> None:
+def _draw_map(out: str, rows: Rows, env: envs.Task, title: str) -> None:
     from qdos_brax.report.coverage import draw_coverage  # here, for matplotlib takes a while
 
     if rows.qpos is None or rows.qpos.shape[1:] != (env.engine.nq,):
@@ -182,7 +182,7 @@ def _draw_map(out: str, rows: Rows, env: envs.TaskEnv, title: str) -> None:
     print(out)
 
 
-def _env(name: str, physics: str) -> envs.TaskEnv:
+def _env(name: str, physics: str) -> envs.Task:
     try:
         return envs.make(name, physics=physics)
     except ValueError as error:  # envs knows nothing of UserError; its lines are made for the user all the same

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+import envs
 from qdos_brax.config import scan
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.methods import settings as method_settings
@@ -93,20 +94,30 @@ def _asked(values: Mapping[str, Any]) -> Config:
 
 def _layers(env: str, preset: str | None, flags: Mapping[str, Any] | None, sets: Sequence[str]) -> dict[str, Any]:
     """All layers laid over one another, by dotted key."""
-    family = env.split("-")[0]
-    if family not in families():
-        raise UserError(f"unknown task {env!r}{nearest(family, families())}; the families are {', '.join(families())}")
+    family = _family_of(env)
     flags = _checked_keys(flags or {}, "a flag")
     method = _known_method(flags.get("method", Config.method))
     preset = preset or default_preset()
     values: dict[str, Any] = {}
-    values |= _read_layer(CONFIG_DIR / f"{family}.yaml")
+    values |= _read_layer(CONFIG_DIR / f"{family}.yaml") if family in families() else {}
     values |= _checked_keys(method_settings(method, family), f"the recipe of {method}")
     values |= _read_preset(preset, family, METHODS[method].source)
     values |= {"env": env, "preset": preset}
     values |= flags
     values |= dict(_parse_set(text) for text in sets)
     return values
+
+
+def _family_of(env: str) -> str:
+    """Return the family of a task's name.
+
+    Raises:
+        UserError: there is no such task.
+    """
+    try:
+        return envs.get_spec(env).family
+    except ValueError as error:  # envs knows nothing of UserError; its lines are made for the user all the same
+        raise UserError(str(error)) from None
 
 
 def default_preset() -> str:

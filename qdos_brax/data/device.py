@@ -1,4 +1,4 @@
-"""The data set on the device: loaded once, normalised once, shared by every member of a population."""
+"""Hold the data set on the device: loaded once, normalised once, shared by every member of a population."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from qdos_brax.data.segments import episode_last, segment_starts
 
 
 class Normaliser(struct.PyTreeNode):
-    """Fixed statistics of the data: x -> (x - mean) / scale.
+    """Normalise by fixed statistics of the data: x -> (x - mean) / scale.
 
     Attributes:
         mean: float32[obs].
@@ -23,17 +23,17 @@ class Normaliser(struct.PyTreeNode):
     scale: jax.Array
 
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """Normalises [..., obs]."""
+        """Return ``observation[..., obs]`` normalised."""
         return (observation - self.mean) / self.scale
 
     def repeated(self, members: int) -> dict[str, jax.Array]:
-        """Its fields, with a leading axis of ``members`` copies."""
+        """Return its fields, with a leading axis of ``members`` copies."""
         fields = {"mean": self.mean, "scale": self.scale}
         return {name: jnp.broadcast_to(x, (members, *x.shape)) for name, x in fields.items()}
 
 
 class DeviceData(struct.PyTreeNode):
-    """N transitions as device arrays; observations are normalised, rewards and masks are the task's.
+    """Hold N transitions as device arrays; observations are normalised, rewards and masks are the task's.
 
     Attributes:
         observations: float32[N, obs].
@@ -45,6 +45,7 @@ class DeviceData(struct.PyTreeNode):
         last: int32[N], the last row of each row's episode.
         qpos: float32[N, nq], or None when the file holds no simulator states.
         qvel: float32[N, nv], or None.
+        extra: int32[N, e], the discrete state, or None.
     """
 
     observations: jax.Array
@@ -56,10 +57,11 @@ class DeviceData(struct.PyTreeNode):
     last: jax.Array
     qpos: jax.Array | None
     qvel: jax.Array | None
+    extra: jax.Array | None = None
 
 
 def to_device(dataset: Dataset, horizon: int) -> tuple[DeviceData, Normaliser]:
-    """Puts ``dataset`` on the default device, normalised by its own statistics."""
+    """Put ``dataset`` on the default device, normalised by its own statistics."""
     mean = dataset.observations.mean(axis=0, dtype=np.float64).astype(np.float32)
     scale = np.maximum(dataset.observations.std(axis=0, dtype=np.float64), 1e-3).astype(np.float32)
     normaliser = Normaliser(jnp.asarray(mean), jnp.asarray(scale))
@@ -73,5 +75,6 @@ def to_device(dataset: Dataset, horizon: int) -> tuple[DeviceData, Normaliser]:
         last=jnp.asarray(episode_last(dataset.ends)),
         qpos=None if dataset.qpos is None else jnp.asarray(dataset.qpos),
         qvel=None if dataset.qvel is None else jnp.asarray(dataset.qvel),
+        extra=None if dataset.extra is None else jnp.asarray(dataset.extra),
     )
     return data, normaliser

@@ -13,6 +13,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from envs.mazes.maze_task import LARGEST_MOVE
+from envs.task import Task
 from qdos_brax.data import checks
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.labelling import label
@@ -24,17 +26,17 @@ from qdos_brax.errors import UserError
 _CHUNK_BYTES = 1 << 19
 
 
-def read(path: str | os.PathLike[str], env: Any) -> Dataset:
-    """The transitions of ``path``, labelled for the task of ``env``.
+def read(path: str | os.PathLike[str], env: Task) -> Dataset:
+    """Return the transitions of ``path``, labelled for the task of ``env``.
 
     Args:
         path: an OGBench ``.npz``, a D4RL-flat ``.hdf5`` (also ``.h5``), a Minari folder or its ``main_data.hdf5``.
-        env: the task, for its sizes and its ``success``.
+        env: the task, for its sizes, checks and labels.
 
     Raises:
         UserError: unreadable, incomplete, not finite, or made for another task or action space.
     """
-    rows = load(path)
+    rows = load(path, env.jump)
     lines = checks.errors(rows, env)
     if lines:
         more = f" (and {len(lines) - 1} more, see: data check)" if len(lines) > 1 else ""
@@ -42,18 +44,26 @@ def read(path: str | os.PathLike[str], env: Any) -> Dataset:
     return label(rows, env, str(path))
 
 
-def load(path: str | os.PathLike[str]) -> Rows:
-    """The rows of ``path``, not yet checked or labelled; raises UserError when unreadable."""
+def load(path: str | os.PathLike[str], jump: float | None = LARGEST_MOVE) -> Rows:
+    """Return the rows of ``path``, not yet checked or labelled.
+
+    Args:
+        path: as for ``read``.
+        jump: the task's ``jump``, which D4RL's files need; where the task is not known that of the mazes.
+
+    Raises:
+        UserError: unreadable or incomplete.
+    """
     path = data_file(path)
     if not _is_hdf5(path):
         return ogbench.load(path)
     with unreadable(path), h5py.File(path, "r") as file:
         by_episode = minari.is_minari(file)
-    return minari.load(path) if by_episode else d4rl.load(path)
+    return minari.load(path) if by_episode else d4rl.load(path, jump)
 
 
 def data_file(path: str | os.PathLike[str]) -> Path:
-    """The one file that ``path`` stands for: itself, or what holds the episodes of a Minari folder.
+    """Return the one file that ``path`` stands for: itself, or what holds the episodes of a Minari folder.
 
     Raises:
         UserError: there is none.
@@ -67,7 +77,7 @@ def data_file(path: str | os.PathLike[str]) -> Path:
 
 
 def write_hdf5(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any]) -> None:
-    """Writes ``arrays`` (keys as in the file, ``infos/qpos`` for a group) whole or not at all, with checksums.
+    """Write ``arrays`` (keys as in the file, ``infos/qpos`` for a group) whole or not at all, with checksums.
 
     Args:
         path: the ``.hdf5`` file; folders are made.
@@ -99,7 +109,7 @@ def write_hdf5(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], a
 
 
 def read_attrs(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The attributes of an ``.hdf5`` file without the checksums; empty for other files."""
+    """Return the attributes of an ``.hdf5`` file without the checksums; empty for other files."""
     path = data_file(path)
     if not _is_hdf5(path):
         return {}

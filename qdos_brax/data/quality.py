@@ -1,34 +1,34 @@
-"""How good a segment truly is, and how well scores tell good ones from bad ones. For measuring, never for training."""
+"""Measure how good a segment truly is, and how well scores separate good from bad. Never for training."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from scipy.stats import rankdata
 
+from envs.task import Task
 from qdos_brax.data.dataset import Dataset
 
 QUALITY = {"navigate": 0, "noisy": 1, "wander": 2, "fail": 3}
 """What produced a step; every code but 0 is degraded behaviour."""
 
-MARGIN = 1.5
-"""Maze units (a cell has 4) that a segment must gain or lose to count as progress or as a setback."""
 
+def progress(env: Task, dataset: Dataset, starts: np.ndarray, horizon: int) -> np.ndarray | None:
+    """Return float64[S], distance left at s_0 minus at s_H, of the segments that begin at ``starts``.
 
-def progress(env: Any, dataset: Dataset, starts: np.ndarray, horizon: int) -> np.ndarray:
-    """float64[S], distance left at s_0 minus distance left at s_H, of the segments that begin at ``starts``.
-
-    ``env.true_distance`` is the shortest path to the task's goal (soccer: agent to ball plus ball to goal). Positions
-    are stored before the action, so a segment that ends its episode is measured at s_{H-1}, one step short. A
-    teleporter may lose a segment infinitely much, by an exit without a way out.
+    ``env.distance_left`` is, in a maze, the shortest path to the task's goal (soccer: agent to ball plus ball to goal);
+    None for a task that has no such measure. Positions are stored before the action, so a segment that ends its episode
+    is measured at s_{H-1}, one step short. A teleporter may lose a segment infinitely much, by an exit without a way
+    out.
 
     Raises:
         ValueError: the dataset has no qpos.
     """
     if dataset.qpos is None:
         raise ValueError(f"{dataset.source}: progress needs the simulator's qpos")
-    distance = np.asarray(env.true_distance(dataset.qpos), np.float64)
+    measured = env.distance_left(dataset.qpos, dataset.extra)
+    if measured is None:
+        return None
+    distance = np.asarray(measured, np.float64)
     last = np.asarray(starts) + horizon - 1
     before = distance[starts]
     after = distance[np.where(dataset.ends[last], last, np.minimum(last + 1, dataset.size - 1))]
@@ -37,7 +37,7 @@ def progress(env: Any, dataset: Dataset, starts: np.ndarray, horizon: int) -> np
 
 
 def auc(scores: np.ndarray, positive: np.ndarray) -> float:
-    """The chance that a positive's score exceeds a negative's, ties counted half (ROC AUC); NaN without both kinds.
+    """Return the ROC AUC: how likely a positive's score exceeds a negative's, ties counted half; NaN without both.
 
     Args:
         scores: float[S].
@@ -53,23 +53,25 @@ def auc(scores: np.ndarray, positive: np.ndarray) -> float:
 
 
 def report(
-    scores: np.ndarray, weights: np.ndarray, gains: np.ndarray, degraded: np.ndarray | None = None
+    scores: np.ndarray, weights: np.ndarray, gains: np.ndarray, margin: float, degraded: np.ndarray | None = None
 ) -> dict[str, float]:
-    """How well ``scores`` (advantages) rank segments, and what ``weights`` made of them.
+    """Return how well ``scores`` (advantages) rank segments, and what ``weights`` made of them.
 
     Args:
         scores: float[S], higher should mean better.
         weights: float[S], non-negative training weights of the same segments.
-        gains: float[S], ``progress`` in maze units.
+        gains: float[S], ``progress``.
+        margin: gain that counts as progress, or lost as a setback, such as the task's ``distance_margin``.
         degraded: bool[S], behaviour known to be bad, or None.
 
     Returns:
-        auc_progress: gains > MARGIN against gains < -MARGIN. auc_degraded: undegraded against degraded.
+        auc_progress: gains > margin against gains < -margin. auc_degraded: undegraded against degraded.
         effective_share: effective sample size (sum w)^2 / sum w^2, as a share of S. losing_share, gaining_share: share
-        of all segments that lose or gain more than MARGIN. losing_weight, gaining_weight: their shares of the weight.
+        of all segments that lose or gain more than ``margin``. losing_weight, gaining_weight: their shares of the
+        weight.
     """
     weights = np.asarray(weights, np.float64)
-    losing, gaining = gains < -MARGIN, gains > MARGIN
+    losing, gaining = gains < -margin, gains > margin
     decided = losing | gaining
     total = weights.sum()
     numbers = {

@@ -1,4 +1,4 @@
-"""Windows of H steps: where they may start, how a batch of them is read, what reward and mask they have as one step."""
+"""Cut windows of H steps: where they may start, how a batch is read, what reward and mask they have as one step."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Tree = TypeVar("Tree")
 
 
 def segment_starts(ends: np.ndarray, horizon: int) -> np.ndarray:
-    """int32[S], every t whose window [t, t + horizon) lies inside one episode.
+    """Return int32[S], every t whose window [t, t + horizon) lies inside one episode.
 
     Args:
         ends: bool[N], the last row of each episode.
@@ -28,13 +28,13 @@ def segment_starts(ends: np.ndarray, horizon: int) -> np.ndarray:
 
 
 def episode_last(ends: np.ndarray) -> np.ndarray:
-    """int32[N], the last row of the episode that each row belongs to; ``ends``: bool[N], the last rows."""
+    """Return int32[N], the last row of the episode that each row belongs to; ``ends``: bool[N], the last rows."""
     bounds = episode_bounds(np.asarray(ends, bool))
     return np.repeat(bounds[:, 1] - 1, bounds[:, 1] - bounds[:, 0]).astype(np.int32)
 
 
 def window(tree: Tree, starts: jax.Array, horizon: int) -> Tree:
-    """The windows that begin at ``starts[B]``: every leaf [N, ...] of ``tree`` becomes [B, horizon, ...].
+    """Return the windows that begin at ``starts[B]``: every leaf [N, ...] of ``tree`` becomes [B, horizon, ...].
 
     For use inside jit; ``starts`` must come from ``segment_starts``, since an index past the end is clamped.
     """
@@ -43,7 +43,7 @@ def window(tree: Tree, starts: jax.Array, horizon: int) -> Tree:
 
 
 def macro_return(rewards: jax.Array, masks: jax.Array, discount: float | jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A window seen as one macro step.
+    """Return a window's reward and mask as one macro step.
 
     The reward is the discounted sum over the live steps: all up to the first with mask 0, whose own reward counts.
 

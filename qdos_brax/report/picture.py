@@ -1,4 +1,4 @@
-"""The picture of a task, as a PNG file."""
+"""Draw a task, as a PNG."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from qdos_brax.files import user_errors
 
 
 def draw_task(name: str, out: Path) -> None:
-    """Draw the maze of a task from above, with the body at a start and the target at the goal.
+    """Draw a task as its scene is seen (a maze from above), at a start and with the mark of the goal.
 
     Args:
-        name: the task's name.
-        out: the file, ending in .png; its folder must exist.
+        name: of the task.
+        out: the picture, ending in .png; its folder must exist.
 
     Raises:
-        UserError: there is no such task, this machine cannot draw, or the file cannot be written.
+        UserError: there is no such task, this machine cannot draw, or the picture cannot be written.
     """
     if out.suffix != ".png":
         raise UserError(f"a picture is written as .png, not as {out.name}; choose another name for it")
@@ -29,7 +29,7 @@ def draw_task(name: str, out: Path) -> None:
         env = envs.make(name, physics="mujoco")
         state = env.reset(jax.random.key(0))
         with Renderer(env, height=720) as renderer:
-            image = renderer.frame(state.pipeline_state.qpos, state.info["goal_xy"])
+            image = renderer.frame(state.pipeline_state.qpos, state.info["goal"])
     except (ValueError, NoOpenGL) as error:  # envs knows nothing of UserError; its lines are made for the user
         raise UserError(str(error)) from error
     with user_errors(out):

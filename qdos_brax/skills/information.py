@@ -1,4 +1,4 @@
-"""Where the states of the mutual-information term come from: the simulator, or the log."""
+"""Give the states of the mutual-information term: from the simulator, or from the log."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from functools import partial
 from typing import Any
 
 import jax
-from brax.envs.base import Env, State
+from brax.envs.base import State
 
+from envs.task import Task
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.data.segments import window
 from qdos_brax.errors import UserError
@@ -15,7 +16,7 @@ from qdos_brax.skills.vae import SkillModel
 
 
 class PhysicsRollout:
-    """Plays each skill in the simulator, from the logged simulator state at the start of its segment.
+    """Play each skill in the simulator, from the logged simulator state at the start of its segment.
 
     Args:
         env: the task's environment; episode ends are ignored, a rollout always has H steps.
@@ -28,32 +29,37 @@ class PhysicsRollout:
         UserError: it holds none.
     """
 
-    def __init__(self, env: Env, model: SkillModel, normaliser: Normaliser, horizon: int, data: DeviceData) -> None:
+    def __init__(self, env: Task, model: SkillModel, normaliser: Normaliser, horizon: int, data: DeviceData) -> None:
         if data.qpos is None or data.qvel is None:
             raise UserError(
                 "the data set holds no qpos and qvel to start rollouts from; use --set skills.mi_rollout=logged"
             )
+        if env.extra_size and data.extra is None:
+            raise UserError(
+                "the data set holds no discrete state to start rollouts from; use --set skills.mi_rollout=logged"
+            )
         self._env, self._model, self._normalise, self._horizon = env, model, normaliser, horizon
 
     def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
-        """Normalised observations[B, H, obs] before each action of the rollouts."""
+        """Return normalised observations[B, H, obs] before each action of the rollouts."""
 
-        def one(qpos: jax.Array, qvel: jax.Array, key: jax.Array, skill: jax.Array) -> jax.Array:
+        def one(qpos: jax.Array, qvel: jax.Array, extra: Any, key: jax.Array, skill: jax.Array) -> jax.Array:
             def step(state: State, _: None) -> tuple[State, jax.Array]:
                 observation = self._normalise(state.obs)
                 return self._env.step(state, self._model.act(params, observation, skill)), observation
 
-            start = self._env.reset_to(qpos, qvel, self._env.goal_xy, key)
+            start = self._env.reset_to(qpos, qvel, key=key, extra=extra)
             return jax.lax.scan(step, start, None, length=self._horizon)[1]
 
         assert data.qpos is not None and data.qvel is not None  # refused in __init__
-        # A maze with teleporters draws exits from the key: every logged state has its own, the same for all skills.
+        # What the physics draws (a teleporter's exit), it draws from the key of the logged state, for all skills.
         keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(starts)
-        return jax.vmap(one)(data.qpos[starts], data.qvel[starts], keys, latent)
+        extra = None if data.extra is None else data.extra[starts]
+        return jax.vmap(one)(data.qpos[starts], data.qvel[starts], extra, keys, latent)
 
 
 class LoggedStates:
-    """Decodes each skill along the logged states of its segment (DiveOff): no simulator.
+    """Decode each skill along the logged states of its segment (DiveOff): no simulator.
 
     Args:
         horizon: H.
@@ -63,5 +69,5 @@ class LoggedStates:
         self._horizon = horizon
 
     def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
-        """Normalised observations[B, H, obs] of the segments."""
+        """Return normalised observations[B, H, obs] of the segments."""
         return window(data.observations, starts, self._horizon)

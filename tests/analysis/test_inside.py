@@ -72,7 +72,7 @@ def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
     # Segment 0 goes from x = 0 to 1; the last of each episode from 1 to 1.9, where the log ends.
     places = np.zeros((3, 15))
     places[:, 0] = 0, 1, 1.9
-    left = envs.make("antmaze-medium", physics="mujoco").true_distance(places)
+    left = envs.make("antmaze-medium", physics="mujoco").distance_left(places)
     expected = [left[0] - left[1], *[left[1] - left[2]] * 3]
     np.testing.assert_allclose(found["gain"][[0, 10, 21, 32]], expected, atol=1e-4)
     assert found["quality"].tolist() == [0] * 11 + [1] * 11 + [2] * 11
@@ -88,7 +88,7 @@ def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
     env = envs.make("antmaze-medium", physics="mujoco")
     start = np.zeros(15)
     start[:2] = found["0/path"][0]
-    assert found["0/left"][0] == pytest.approx(float(env.true_distance(start)), rel=1e-5)
+    assert found["0/left"][0] == pytest.approx(float(env.distance_left(start)), rel=1e-5)
     if opengl_or_not:
         assert found["0/frames"].shape == (6, 48, 48, 3) and found["0/frame_steps"].tolist() == [0, 5, 10, 15, 20, 25]
 

@@ -54,5 +54,5 @@ def collector(task: str, recipe: str) -> Collector:
     return Collector(env, recipe_of(env, recipe), EXPERTS[env.spec.family]())
 
 
-def recipe_of(env: envs.TaskEnv, name: str) -> CollectionRecipe:
+def recipe_of(env: envs.Task, name: str) -> CollectionRecipe:
     return degraded(0.5, profile_of(env)) if name == "mixed" else named(name, profile_of(env))

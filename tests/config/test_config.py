@@ -8,15 +8,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import envs
 from qdos_brax import config as configs
 from qdos_brax.config import Config, load_config, schema
 from qdos_brax.errors import UserError
 
 
+@pytest.fixture(autouse=True)
+def every_family_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have tasks for the YAMLs whose families are not written yet."""
+    for name, variant in (("cube", "single"), ("kitchen", "mixed"), ("scene", "")):
+        if name not in envs.FAMILIES:
+            variants = {variant: envs.Variant(1, 1, 1)}
+            monkeypatch.setitem(envs.FAMILIES, name, envs.Family("none:none", ("mujoco",), variants, variant))
+            monkeypatch.setitem(envs.ALIASES, name, f"{name}-{variant}" if variant else name)
+
+
 @pytest.mark.parametrize("preset", configs.presets())
 @pytest.mark.parametrize("family", configs.families())
 def test_every_family_loads_with_every_preset(family: str, preset: str, tmp_path: Path) -> None:
-    config = load_config(f"{family}-x", preset)
+    config = load_config(family, preset)
     path = tmp_path / "config.yaml"
     path.write_text(configs.to_yaml(config))
     assert configs.from_yaml(path) == config
@@ -120,7 +131,7 @@ def test_wrong_settings_are_one_line(text: str, message: str) -> None:
 
 
 def test_unknown_names_propose_the_nearest() -> None:
-    with pytest.raises(UserError, match="did you mean 'antmaze'"):
+    with pytest.raises(UserError, match="did you mean 'antmaze-large'"):
         load_config("antmase-large", "cpu")
     with pytest.raises(UserError, match="did you mean 'smoke'"):
         load_config("antmaze", "smokey")

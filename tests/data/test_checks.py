@@ -17,7 +17,7 @@ TASK = "antmaze-medium-task1"
 
 
 @pytest.fixture(scope="module")
-def env() -> envs.TaskEnv:
+def env() -> envs.Task:
     return envs.make(TASK, physics="mujoco")
 
 
@@ -39,11 +39,11 @@ def walk() -> Rows:
     )
 
 
-def findings(rows: Rows, env: envs.TaskEnv, made_for: str | None = None) -> checks.Findings:
+def findings(rows: Rows, env: envs.Task, made_for: str | None = None) -> checks.Findings:
     return checks.inspect(rows, env, 20, {} if made_for is None else {"env": made_for})
 
 
-def test_a_good_set_has_no_errors(env: envs.TaskEnv) -> None:
+def test_a_good_set_has_no_errors(env: envs.Task) -> None:
     found = findings(walk(), env)
     assert found.errors == [] and found.notes == ["no row is at the task's goal: no reward to learn from"]
 
@@ -75,7 +75,7 @@ def _shift_ends(rows: Rows) -> None:
         ),
     ],
 )
-def test_every_fault_is_one_line(env: envs.TaskEnv, spoil: Callable[[Rows], None], says: str) -> None:
+def test_every_fault_is_one_line(env: envs.Task, spoil: Callable[[Rows], None], says: str) -> None:
     rows = walk()
     spoil(rows)
     errors = findings(rows, env).errors
@@ -83,7 +83,7 @@ def test_every_fault_is_one_line(env: envs.TaskEnv, spoil: Callable[[Rows], None
     assert len(errors) == 1 and "\n" not in errors[0]
 
 
-def test_rewards_are_compared_with_the_task(env: envs.TaskEnv) -> None:
+def test_rewards_are_compared_with_the_task(env: envs.Task) -> None:
     """-1 everywhere is right, for the walk is never at the goal; D4RL's 0 means the same."""
     rows = walk()
     for right in (-np.ones(120, np.float32), np.zeros(120, np.float32)):
@@ -99,7 +99,7 @@ def test_rewards_are_compared_with_the_task(env: envs.TaskEnv) -> None:
     assert found.errors == [] and "rewards of another task or goal in 2 rows (first 4)" in found.notes[1]
 
 
-def test_lengths_are_compared_with_horizon_and_cap(env: envs.TaskEnv) -> None:
+def test_lengths_are_compared_with_horizon_and_cap(env: envs.Task) -> None:
     ends = np.zeros(12, bool)
     ends[[2, 11]] = True
     assert checks.horizon_lines(ends, 5) == ([], ["1 of 2 episodes are shorter than 5 steps and give no segment"])

@@ -24,7 +24,7 @@ TASK = "antmaze-medium-task1"
 
 
 @pytest.fixture(scope="module")
-def env() -> envs.TaskEnv:
+def env() -> envs.Task:
     return envs.make(TASK, physics="mujoco")
 
 
@@ -62,7 +62,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     }
 
 
-def outcome(path: Path, env: envs.TaskEnv) -> Rows | None:
+def outcome(path: Path, env: envs.Task) -> Rows | None:
     """What comes of a file on the way to training and through ``data check``; None where it is refused."""
     try:
         rows = formats.load(path)
@@ -97,7 +97,7 @@ def truncate(content: bytes, rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize("kind", FORMATS)
 def test_flipped_and_missing_bytes(
     tmp_path: Path,
-    env: envs.TaskEnv,
+    env: envs.Task,
     whole: Mapping[str, Path],
     kind: str,
     damage: Callable[[bytes, np.random.Generator], bytes],
@@ -117,7 +117,7 @@ def test_flipped_and_missing_bytes(
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_missing_arrays(tmp_path: Path, env: envs.TaskEnv, whole: Mapping[str, Path], kind: str) -> None:
+def test_missing_arrays(tmp_path: Path, env: envs.Task, whole: Mapping[str, Path], kind: str) -> None:
     """Only what may be missing in such a file may be missing."""
     may_go = {
         "npz": {"qvel"},
@@ -139,7 +139,7 @@ def test_missing_arrays(tmp_path: Path, env: envs.TaskEnv, whole: Mapping[str, P
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_swapped_types(tmp_path: Path, env: envs.TaskEnv, whole: Mapping[str, Path], kind: str) -> None:
+def test_swapped_types(tmp_path: Path, env: envs.Task, whole: Mapping[str, Path], kind: str) -> None:
     """Text is refused; rounding to integers or to half precision too where a checksum or a comparison can tell."""
     reference = outcome(whole[kind], env)
     assert reference is not None

@@ -18,11 +18,11 @@ TASK = "antmaze-medium-task1"
 
 
 @pytest.fixture(scope="module")
-def env() -> envs.TaskEnv:
+def env() -> envs.Task:
     return envs.make(TASK, physics="mujoco")
 
 
-def ogbench_rows(env: envs.TaskEnv, lengths: tuple[int, ...] = (7, 5, 9), seed: int = 0) -> dict[str, np.ndarray]:
+def ogbench_rows(env: envs.Task, lengths: tuple[int, ...] = (7, 5, 9), seed: int = 0) -> dict[str, np.ndarray]:
     """Rows as OGBench's generator stores them: T + 1 per trajectory, some at the task's goal."""
     rng = np.random.default_rng(seed)
     n = sum(lengths)
@@ -42,7 +42,7 @@ def ogbench_rows(env: envs.TaskEnv, lengths: tuple[int, ...] = (7, 5, 9), seed: 
     }
 
 
-def d4rl_rows(env: envs.TaskEnv) -> dict[str, np.ndarray]:
+def d4rl_rows(env: envs.Task) -> dict[str, np.ndarray]:
     """The same rows under D4RL's keys, with next observations."""
     rows = ogbench_rows(env)
     n = len(rows["terminals"])
@@ -77,7 +77,7 @@ def test_npz_equals_ogbench_reader_and_relabelling(tmp_path: Path, name: str) ->
     assert dataset.observations.dtype == np.float32 and dataset.observations.flags.c_contiguous
 
 
-def test_npz_cut_inside_a_trajectory_loses_only_the_row_without_a_next_state(tmp_path: Path, env: envs.TaskEnv) -> None:
+def test_npz_cut_inside_a_trajectory_loses_only_the_row_without_a_next_state(tmp_path: Path, env: envs.Task) -> None:
     path = tmp_path / "cut.npz"
     rows = ogbench_rows(env)
     np.savez(path, **{key: value[:-2] for key, value in rows.items()})
@@ -86,7 +86,7 @@ def test_npz_cut_inside_a_trajectory_loses_only_the_row_without_a_next_state(tmp
     np.testing.assert_array_equal(dataset.next_observations[-1], rows["observations"][-3])
 
 
-def test_hdf5_round_trip_keeps_everything(tmp_path: Path, env: envs.TaskEnv) -> None:
+def test_hdf5_round_trip_keeps_everything(tmp_path: Path, env: envs.Task) -> None:
     path = tmp_path / "folder" / "set.hdf5"
     rows = d4rl_rows(env)
     formats.write_hdf5(path, rows, {"env": TASK, "seed": 3})
@@ -109,7 +109,7 @@ def test_hdf5_round_trip_keeps_everything(tmp_path: Path, env: envs.TaskEnv) -> 
     assert [p.name for p in path.parent.iterdir()] == ["set.hdf5"]
 
 
-def test_hdf5_without_positions_takes_its_own_rewards(tmp_path: Path, env: envs.TaskEnv) -> None:
+def test_hdf5_without_positions_takes_its_own_rewards(tmp_path: Path, env: envs.Task) -> None:
     path = tmp_path / "plain.hdf5"
     rows = {key: value for key, value in d4rl_rows(env).items() if not key.startswith("infos/")}
     rows["rewards"] = np.linspace(0, 1, len(rows["rewards"]), dtype=np.float32)
@@ -146,7 +146,7 @@ def _with(array: np.ndarray, index: Any, value: float) -> np.ndarray:
         (lambda r: {k: v[:0] for k, v in r.items()}, "no transitions"),
     ],
 )
-def test_bad_rows_are_one_clear_line(tmp_path: Path, env: envs.TaskEnv, spoil: Any, says: str) -> None:
+def test_bad_rows_are_one_clear_line(tmp_path: Path, env: envs.Task, spoil: Any, says: str) -> None:
     path = tmp_path / "bad.npz"
     np.savez(path, **spoil(ogbench_rows(env)))
     with pytest.raises(UserError, match=says) as error:
@@ -154,7 +154,7 @@ def test_bad_rows_are_one_clear_line(tmp_path: Path, env: envs.TaskEnv, spoil: A
     assert "\n" not in str(error.value)
 
 
-def test_actions_over_by_rounding_are_clipped(tmp_path: Path, env: envs.TaskEnv) -> None:
+def test_actions_over_by_rounding_are_clipped(tmp_path: Path, env: envs.Task) -> None:
     path = tmp_path / "set.npz"
     rows = ogbench_rows(env)
     np.savez(path, **_spoil(rows, "actions", _with(rows["actions"], (0, 0), 1.0005)))
@@ -163,7 +163,7 @@ def test_actions_over_by_rounding_are_clipped(tmp_path: Path, env: envs.TaskEnv)
 
 @pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
-def test_truncated_files_are_refused(tmp_path: Path, env: envs.TaskEnv, suffix: str, share: float) -> None:
+def test_truncated_files_are_refused(tmp_path: Path, env: envs.Task, suffix: str, share: float) -> None:
     path = tmp_path / f"set{suffix}"
     if suffix == ".npz":
         np.savez(path, **ogbench_rows(env))
@@ -175,7 +175,7 @@ def test_truncated_files_are_refused(tmp_path: Path, env: envs.TaskEnv, suffix: 
         formats.read(path, env)
 
 
-def test_other_files_are_refused(tmp_path: Path, env: envs.TaskEnv) -> None:
+def test_other_files_are_refused(tmp_path: Path, env: envs.Task) -> None:
     text, array = tmp_path / "notes.txt", tmp_path / "array.npy"
     text.write_text("hello")
     np.save(array, np.zeros(3))
@@ -196,7 +196,7 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_written_here_notice_any_change_of_their_values(tmp_path: Path, env: envs.TaskEnv) -> None:
+def test_files_written_here_notice_any_change_of_their_values(tmp_path: Path, env: envs.Task) -> None:
     path = tmp_path / "set.hdf5"
     formats.write_hdf5(path, d4rl_rows(env), {})
     with h5py.File(path, "r+") as file:

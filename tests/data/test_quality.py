@@ -28,7 +28,7 @@ def test_progress_is_the_distance_gained_and_stays_in_the_episode() -> None:
     dataset = Dataset(
         blank, blank, blank[:, 0], blank[:, 0], np.array([0, 0, 1, 0, 0, 1], bool), blank, qpos=qpos, source="toy"
     )
-    env = SimpleNamespace(true_distance=lambda q: q[:, 0])
+    env = SimpleNamespace(distance_left=lambda q, extra: q[:, 0])
     gains = quality.progress(env, dataset, np.array([0, 1, 3, 4]), 2)
     np.testing.assert_allclose(gains, [5.0, 3.0, 20.0, 10.0])
 
@@ -37,10 +37,10 @@ def test_progress_where_there_is_no_way() -> None:
     qpos = np.array([[9.0], [np.inf], [np.inf], [np.inf]], np.float32)  # a teleporter's exit without a way out
     blank = np.zeros((4, 1), np.float32)
     dataset = Dataset(blank, blank, blank[:, 0], blank[:, 0], np.zeros(4, bool), blank, qpos=qpos, source="toy")
-    env = SimpleNamespace(true_distance=lambda q: q[:, 0])
+    env = SimpleNamespace(distance_left=lambda q, extra: q[:, 0])
     gains = quality.progress(env, dataset, np.array([0, 1]), 2)
     np.testing.assert_array_equal(gains, [-np.inf, 0.0])
-    numbers = quality.report(np.array([0.0, 1.0]), np.ones(2), gains)
+    numbers = quality.report(np.array([0.0, 1.0]), np.ones(2), gains, 1.5)
     assert numbers["losing_share"] == 0.5 and numbers["gaining_share"] == 0.0
 
 
@@ -50,6 +50,7 @@ def test_report_by_hand() -> None:
         scores=np.array([2.0, 0.0, 1.0, 5.0]),
         weights=np.array([2.0, 1.0, 1.0, 0.0]),
         gains=gains,
+        margin=1.5,
         degraded=np.array([False, False, True, True]),
     )
     assert numbers["auc_progress"] == pytest.approx(0.5)

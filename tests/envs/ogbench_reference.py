@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import ogbench  # noqa: F401  (registers the environments)
 
-from envs import TaskEnv
+from envs import Task
 
 
 def ogbench_env(name: str) -> gymnasium.Env:
@@ -60,13 +60,13 @@ def ogbench_rollout(
     return {key: np.asarray(value) for key, value in rows.items()}
 
 
-def our_rollout(env: TaskEnv, state: Any, actions: np.ndarray) -> Any:
+def our_rollout(env: Task, state: Any, actions: np.ndarray) -> Any:
     """States stacked over time, from ``state`` under ``actions[T, nu]`` (one environment, jitted once per ``env``)."""
     return _rollout_program(env)(state, actions)
 
 
 @cache
-def _rollout_program(env: TaskEnv) -> Any:
+def _rollout_program(env: Task) -> Any:
     def body(carry: Any, action: jax.Array) -> tuple[Any, Any]:
         after = env.step(carry, action)
         return after, after
@@ -74,7 +74,7 @@ def _rollout_program(env: TaskEnv) -> Any:
     return jax.jit(lambda state, actions: jax.lax.scan(body, state, actions)[1])
 
 
-def start_state(env: TaskEnv, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def start_state(env: Task, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """float32 (qpos[nq], qvel[nv]) of a reset."""
     state = env.reset(jax.random.key(seed))
     return np.array(state.pipeline_state.qpos), np.array(state.pipeline_state.qvel)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from envs.bodies import ANT_AND_BALL, HUMANOID, Body
-from envs.physics.constraints import Constraints
+from envs.mazes.bodies import ANT_AND_BALL, HUMANOID, Body
+from envs.physics.mjx.constraints import Constraints
 
 BODIES = [pytest.param(ANT_AND_BALL, id="ant"), pytest.param(HUMANOID, id="humanoid", marks=pytest.mark.slow)]
 

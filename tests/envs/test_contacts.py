@@ -14,7 +14,7 @@ import pytest
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
-from envs.physics.contacts import COLLIDERS, plane_capsule_frame
+from envs.physics.mjx.contacts import COLLIDERS, plane_capsule_frame
 
 MARGIN = 0.02
 PLANE_CAPSULE = (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE)
@@ -153,7 +153,7 @@ def test_floor_frame_equals_c_however_steep() -> None:
 
 
 def test_mjx_still_needs_the_mend() -> None:
-    """Fails once MJX is mended upstream: then ``envs.physics.contacts`` can go."""
+    """Fails once MJX is mended upstream: then ``envs.physics.mjx.contacts`` can go."""
     expected, sizes, scene = capsule_on_floor(20)
     _, _, frames = collision_driver._COLLISION_FUNC[PLANE_CAPSULE](sizes, scene, None, jnp.array([[0, 1]]))
     assert np.abs(np.asarray(frames[0]) - expected).max() > 0.1

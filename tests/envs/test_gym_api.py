@@ -16,10 +16,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import envs
-from envs import gym_api
-from envs.maze import get_maze
+from envs import gym_api, gym_programs
 from tests.envs.ogbench_reference import ogbench_env, ogbench_rollout
-from tests.envs.test_wrappers import Slider
+from tests.envs.test_wrappers import sliding_task
 
 MEDIUM = "qdos/antmaze-medium-task1-v0"
 
@@ -27,22 +26,21 @@ MEDIUM = "qdos/antmaze-medium-task1-v0"
 @pytest.fixture
 def sliding(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """A task to be reckoned by hand: a point that moves by its action, breaks above 8, and is cut off after 3 steps."""
-    spec = envs.TaskSpec("toy-arena", "toy", "arena", 1, 3)
-    task = envs.TaskEnv(spec, get_maze("arena"), Slider(), np.zeros(2), (0,), ((1, 1),), (1, 3))
-    monkeypatch.setattr(gym_api, "make", lambda name, physics: task)
+    task = sliding_task()
+    monkeypatch.setattr(gym_programs, "make", lambda name, physics: task)
     monkeypatch.setattr(gym_api, "steps_per_second", lambda task: 10.0)
-    gym_api._programs.cache_clear()
+    gym_programs.programs.cache_clear()
     yield task
-    gym_api._programs.cache_clear()
+    gym_programs.programs.cache_clear()
 
 
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Episodes of 30 steps."""
-    monkeypatch.setattr(envs.TaskEnv, "episode_length", 30)
-    gym_api._programs.cache_clear()
+    monkeypatch.setattr(envs.Task, "episode_length", 30)
+    gym_programs.programs.cache_clear()
     yield 30
-    gym_api._programs.cache_clear()
+    gym_programs.programs.cache_clear()
 
 
 def put(env: Any, qpos: Any, qvel: Any) -> None:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.maze import Maze, get_maze
+from envs.mazes.maze import Maze, get_maze
 from tests.envs.ogbench_reference import ogbench_env
 
 

@@ -17,10 +17,11 @@ import pytest
 
 import envs
 from benchmarks import exactness
-from envs.bodies import ANT
-from envs.maze import get_maze
-from envs.physics.integrators import integrate
-from envs.physics.mjx_engine import MjxEngine
+from envs.mazes.bodies import ANT
+from envs.mazes.maze import get_maze
+from envs.mazes.walls import NearWalls
+from envs.physics.mjx.engine import MjxEngine
+from envs.physics.mjx.integrators import integrate
 
 FREE_P99, TOUCHING_P99 = 1e-5, 1e-3  # of the error in qpos after one control step
 
@@ -56,9 +57,9 @@ def test_models_it_cannot_step_are_refused() -> None:
     model = ANT.near(True)
     model.dof_frictionloss[6] = 1.0
     with pytest.raises(ValueError, match="without equalities and friction loss"):
-        MjxEngine(model, get_maze("medium"), ANT.most_contacts)
+        MjxEngine(model, NearWalls(get_maze("medium")), ANT.most_contacts)
     with pytest.raises(ValueError, match="contacts of dimension 3"):
-        MjxEngine(ANT.near(True), get_maze("medium"), {})
+        MjxEngine(ANT.near(True), NearWalls(get_maze("medium")), {})
     model = ANT.near(True)
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
     with pytest.raises(ValueError, match="Euler or RK4"):

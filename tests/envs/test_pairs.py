@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from envs.models.pairs import list_pairs
+from envs.physics.mujoco.pairs import list_pairs
 
 # Bodies of several geoms, one with priority, a welded one, parent and child, bits that let few touch.
 CROWD = """

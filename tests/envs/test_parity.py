@@ -14,7 +14,7 @@ from tests.envs.ogbench_reference import ogbench_env, ogbench_rollout, our_rollo
 STEPS = 200
 
 
-def start_positions(env: envs.TaskEnv, kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def start_positions(env: envs.Task, kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """A start: at the task's own, pressed against walls, or about to reach the goal."""
     qpos, qvel = start_state(env, seed)
     soccer = env.spec.family == "antsoccer"

@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 import scipy.optimize
 
-from envs.physics.solver import solve, solve_positive
+from envs.physics.mjx.solver import solve, solve_positive
 
 NV, ROWS = 14, 56
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs import locomotion
+from envs.mazes import locomotion
 from envs.physics import resolve_physics
 
 # nq, nv, observation, action (OGBench 1.2.2)
@@ -26,8 +26,9 @@ def test_every_task_resets_and_steps(spec: envs.TaskSpec) -> None:
     nq, nv, obs_size, action_size = SIZES[spec.family]
     assert (env.observation_size, env.action_size) == (obs_size, action_size)
     assert env.episode_length == CAPS.get(spec.name, 1000)
-    family = envs.FAMILIES[spec.family]
-    assert (family.observation_size, family.action_size) == (obs_size, action_size)
+    variant = envs.FAMILIES[spec.family].variants[spec.variant]
+    assert (variant.observation_size, variant.action_size) == (obs_size, action_size)
+    assert variant.episode_length == env.episode_length
     assert env.spec == spec and env.backend == "mujoco"
     before = jax.vmap(env.reset)(jax.random.split(jax.random.key(spec.task_id), 2))
     after = jax.vmap(env.step)(before, jnp.ones((2, action_size)))
@@ -38,7 +39,7 @@ def test_every_task_resets_and_steps(spec: envs.TaskSpec) -> None:
     np.testing.assert_array_equal(after.reward, [-1, -1])
     np.testing.assert_array_equal(after.done, [0, 0])
     np.testing.assert_array_equal(after.info["steps"], [1, 1])
-    distance = env.true_distance(np.asarray(before.pipeline_state.qpos))
+    distance = env.distance_left(np.asarray(before.pipeline_state.qpos))
     assert (distance > 1.5).all() and np.isfinite(distance).all()
     same = np.flatnonzero(before.pipeline_state.qpos[0] == before.pipeline_state.qpos[1])
     assert same.tolist() == ([2] if spec.family == "humanoidmaze" else [])  # it starts at a height of 1.5
@@ -85,7 +86,7 @@ def test_reset_noise_is_ogbenchs() -> None:
     assert np.abs(rest).max() <= 0.1 + 1e-6
     np.testing.assert_allclose(rest.std(axis=0), 0.2 / np.sqrt(12), rtol=0.1)
     np.testing.assert_allclose(qvel.std(axis=0), 0.1, rtol=0.1)
-    np.testing.assert_array_equal(states.info["goal_xy"][0], env.goal_xy)
+    np.testing.assert_array_equal(states.info["goal"][0], env.goal_xy)
     np.testing.assert_array_equal(env.goal_xy, [0, 20])
 
 
@@ -144,10 +145,10 @@ def test_reset_takes_cells() -> None:
     for index, xy in ((0, (16, 4)), (15, (20, 20))):
         shifts = np.asarray(state.pipeline_state.qpos[:, index : index + 2]) - xy
         assert np.abs(shifts).max() <= 1.0 and shifts.std() > 0.5
-    np.testing.assert_array_equal(state.info["goal_xy"], np.tile([0.0, 8.0], (50, 1)))
+    np.testing.assert_array_equal(state.info["goal"], np.tile([0.0, 8.0], (50, 1)))
     own = jax.jit(jax.vmap(env.reset))(keys)  # the same but for the cells
     np.testing.assert_array_equal(own.pipeline_state.qpos[:, 2:15], state.pipeline_state.qpos[:, 2:15])
-    np.testing.assert_array_equal(own.info["goal_xy"][0], env.goal_xy)
+    np.testing.assert_array_equal(own.info["goal"][0], env.goal_xy)
     inside = jax.jit(lambda key, cell: env.reset(key, start_ij=cell).pipeline_state.qpos)(keys[0], jnp.array([2, 5]))
     np.testing.assert_allclose(inside[:2], state.pipeline_state.qpos[0, :2], atol=1e-6)
 
@@ -190,8 +191,8 @@ def test_true_distance_known_values() -> None:
     soccer = envs.make("antsoccer-arena", physics="mujoco")  # open: straight lines
     qpos = np.zeros((1, 22))
     qpos[0, :2], qpos[0, 15:17] = (3.0, 4.0), (0.0, 0.0)
-    np.testing.assert_allclose(soccer.true_distance(qpos), [5.0 + 20.0])
+    np.testing.assert_allclose(soccer.distance_left(qpos), [5.0 + 20.0])
     maze = envs.make("antmaze-medium-task5", physics="mujoco")  # goal in (1, 1)
     ant = np.zeros((2, 15))
     ant[0, :2], ant[1, :2] = (1.0, 1.0), (4.0, 4.0)
-    np.testing.assert_allclose(maze.true_distance(ant), np.hypot([1, 4], [1, 4]))
+    np.testing.assert_allclose(maze.distance_left(ant), np.hypot([1, 4], [1, 4]))

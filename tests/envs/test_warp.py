@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs.mazes.walls import NearWalls
 from envs.physics import why_not
 from qdos_brax.commands import doctor
 
@@ -48,11 +49,12 @@ def test_doctor_says_which_engines_run_here(monkeypatch: pytest.MonkeyPatch) -> 
 def test_its_steps_on_a_cpu_are_near_cs() -> None:
     """One kick of the ant in the air, then on the floor; and a population's axis, which joins the batch."""
     pytest.importorskip("warp", reason="the optional package warp-lang")
-    from envs.physics.warp_engine import MjxWarpEngine
+    from envs.physics.mjx.warp_engine import MjxWarpEngine
 
     env = envs.make("antmaze-medium", physics="mujoco")
     body = env.body
-    engine = MjxWarpEngine(body.near(True), env.layout, body.most_contacts, body.places, sensors=body.sensors)
+    near_walls = NearWalls(env.layout, body.places)
+    engine = MjxWarpEngine(body.near(True), near_walls, body.most_contacts, sensors=body.sensors)
     step = jax.jit(jax.vmap(jax.vmap(engine.step)))
     exact_step = jax.jit(jax.vmap(jax.vmap(env.engine.step)))
     start = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 8)).pipeline_state
@@ -67,7 +69,7 @@ def test_its_steps_on_a_cpu_are_near_cs() -> None:
         assert np.abs(np.asarray(ends[1].qpos) - qpos).max() > 0.05
 
     # what does not fit shows: room for the limits' 8 rows alone, and several legs on the floor, of 4 rows each
-    cramped = MjxWarpEngine(body.near(True), env.layout, {3: 0}, body.places)
+    cramped = MjxWarpEngine(body.near(True), near_walls, {3: 0})
     lowered = start.qpos.at[:, 2].add(-0.5)
     after = jax.jit(jax.vmap(cramped.step))(jax.vmap(cramped.init)(lowered, start.qvel), jnp.zeros((8, 8)))
     assert bool(jnp.isnan(after.qpos).all())

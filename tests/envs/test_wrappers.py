@@ -11,28 +11,34 @@ import pytest
 from brax.envs.base import State
 
 import envs
-from envs.maze import get_maze
+from envs.mazes.maze import get_maze
+from envs.mazes.maze_task import MazeTask
 from envs.physics import PipelineState
-from envs.task import TaskEnv, TaskSpec
 
 
 class Slider:
     """A point whose velocity is its action; an action above 8 breaks the physics."""
 
     name = "toy"
-    nq = nv = nu = 2
+    nq = nv = action_size = 2
+    extra_size = 0
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
-        return PipelineState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros(0), jnp.zeros(()))
+    def init(self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None) -> PipelineState:
+        none = jnp.zeros(0, jnp.int32) if extra is None else extra
+        return PipelineState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros(0), none, jnp.zeros(()))
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
         qpos = jnp.where(action[0] > 8, jnp.nan, state.qpos + action)
-        return PipelineState(qpos, action, state.sensed, state.carry + 1)
+        return state.replace(qpos=qpos, qvel=action, carry=state.carry + 1)
+
+
+def sliding_task(cap: int = 3) -> MazeTask:
+    spec = envs.TaskSpec("toy", "arena", 1, cap)
+    return MazeTask(spec, get_maze("arena"), Slider(), np.zeros(2), {"body": 0}, ((1, 1),), (1, 3))
 
 
 def toy(cap: int = 3) -> envs.AutoReset:
-    spec = TaskSpec("toy-arena", "toy", "arena", 1, cap)
-    return envs.AutoReset(TaskEnv(spec, get_maze("arena"), Slider(), np.zeros(2), (0,), ((1, 1),), (1, 3)))
+    return envs.AutoReset(sliding_task(cap))
 
 
 def shapes(state: State) -> Any:

@@ -23,7 +23,7 @@ def constant_skills(action_size: int) -> Any:
     return SimpleNamespace(act=lambda params, observation, skill: jnp.resize(skill, action_size))
 
 
-def rollouts(env: envs.TaskEnv, qpos: np.ndarray, qvel: np.ndarray, latent: np.ndarray) -> np.ndarray:
+def rollouts(env: envs.Task, qpos: np.ndarray, qvel: np.ndarray, latent: np.ndarray) -> np.ndarray:
     """Observations [N - HORIZON + 1, HORIZON, obs], not normalised, from one logged episode with these states [N]."""
     n = len(qpos)
     rows = {"observations": np.zeros((n, env.observation_size)), "actions": np.zeros((n, env.action_size))}

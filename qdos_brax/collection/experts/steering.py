@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.maze import UNIT, Maze
+from envs.mazes.maze import UNIT, Maze
 from qdos_brax.nn.vectors import unit_vector
 
 _CORRIDOR = 1.2  # m that must be free on either side of a straight line: the reach of the ant's legs

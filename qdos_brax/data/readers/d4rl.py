@@ -1,24 +1,45 @@
-"""D4RL's flat ``.hdf5``, which is also what is written here (with ``next_observations`` and checksums)."""
+"""Read D4RL's flat ``.hdf5``, which is also what is written here (with ``next_observations`` and checksums)."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from qdos_brax.data.readers.rows import Rows, after_action, unreadable
-from qdos_brax.data.readers.table import HDF5Table
+from qdos_brax.data.readers.table import DataTable, HDF5Table
 
-_OPTIONAL = ("next_observations", "rewards", "timeouts", "infos/qpos", "infos/qvel", "infos/quality")
-JUMP = 1.5  # no ant or humanoid gets that far in one control step; the first D4RL files have resets without a mark
-_KITCHEN_SIZES = (60, 9)  # numbers per observation and action of D4RL's kitchen
-_KITCHEN_SOLVED = 4.0  # its reward counts the tasks that are complete
+_OPTIONAL = ("next_observations", "rewards", "timeouts", "infos/qpos", "infos/qvel", "infos/extra", "infos/quality")
 
 
-def load(path: Path) -> Rows:
-    """The transitions of a D4RL-flat ``.hdf5``.
+class _Kitchen(NamedTuple):
+    """Describe D4RL's kitchen files, which have no ``timeouts`` and mark the end of every demonstration as terminal."""
 
-    Where episodes end is found, not believed: ant mazes of version 0 have ``timeouts`` out of step, those of version 2
+    observation_size: int
+    action_size: int
+    rewards: tuple[float, ...]  # how many of four subtasks are complete
+
+    def fits(self, table: DataTable, rows: Rows) -> bool:
+        """Return whether the file is one of them: no timeouts, their sizes, and no rewards but theirs."""
+        sizes = (rows.observations.shape[-1], rows.actions.shape[-1])
+        if "timeouts" in table or sizes != (self.observation_size, self.action_size) or rows.rewards is None:
+            return False
+        return bool(np.isin(rows.rewards, self.rewards).all())
+
+
+_KITCHEN = _Kitchen(observation_size=60, action_size=9, rewards=(0.0, 1.0, 2.0, 3.0, 4.0))
+
+
+def load(path: Path, jump: float | None) -> Rows:
+    """Return the transitions of a D4RL-flat ``.hdf5``.
+
+    Args:
+        path: the file.
+        jump: distance that the first two numbers of an observation, a position, never move in one step, which the
+            first D4RL files need to find unmarked resets; None: they are no position.
+
+    Episode ends are checked, not trusted: ant mazes of version 0 have ``timeouts`` out of step, those of version 2
     mark every row at the goal as terminal although the episode goes on, the kitchen has no ``timeouts`` and marks the
     last row of every demonstration as terminal, solved or not. Without next observations the last row of an episode
     is only a next state.
@@ -37,7 +58,7 @@ def load(path: Path) -> Rows:
             (following,) = table.floats("next_observations", None)
             breaks = _breaks(observations, following)
         else:
-            breaks = _jumps(observations) if "infos/qpos" in table else np.zeros(len(observations), bool)
+            breaks = _jumps(observations, jump if "infos/qpos" in table else None)
         ends = marked | breaks
         if len(ends):
             ends[-1] = True
@@ -51,33 +72,36 @@ def load(path: Path) -> Rows:
         for key in ("qpos", "qvel"):
             if f"infos/{key}" in table:
                 setattr(rows, key, table.floats(f"infos/{key}", keep)[0])
+        if "infos/extra" in table:
+            rows.extra = np.round(table.floats("infos/extra", keep)[0]).astype(np.int32)
         if "rewards" in table:
             rows.rewards = table.numbers("rewards", keep)
         if "infos/quality" in table:
             quality = table.column("infos/quality").astype(np.int8)
             rows.quality = quality if keep is None else quality[keep]
-        if "timeouts" not in table:
-            _mend_kitchen(rows)
+        if _KITCHEN.fits(table, rows):
+            rows.terminals = np.asarray(rows.rewards == _KITCHEN.rewards[-1], np.float32)
+            notes.append("no timeouts: demonstrations end at their terminals, and only four complete tasks terminate")
         after_action(path, rows)
         return rows
 
 
 def _breaks(observations: np.ndarray, following: np.ndarray) -> np.ndarray:
-    """bool[N]: the next observation is not the next row's."""
+    """Return bool[N]: the next observation is not the next row's."""
     breaks = np.zeros(len(observations), bool)
     if observations.shape == following.shape:  # else the sizes are reported by the checks
         breaks[:-1] = np.abs(observations[1:] - following[:-1]).reshape(len(breaks) - 1, -1).max(axis=1) > 1e-6
     return breaks
 
 
-def _jumps(observations: np.ndarray) -> np.ndarray:
-    """bool[N]: the body is somewhere else in the next row.
+def _jumps(observations: np.ndarray, jump: float | None) -> np.ndarray:
+    """Return bool[N]: the body is somewhere else in the next row.
 
-    Every body's observation begins with its place. ``infos/qpos`` would not do: D4RL stores it after the action.
+    ``infos/qpos`` would not do: D4RL stores it after the action.
     """
     jumps = np.zeros(len(observations), bool)
-    if observations.ndim == 2:  # else the sizes are reported by the checks
-        jumps[:-1] = np.linalg.norm(np.diff(observations[:, :2], axis=0), axis=1) > JUMP
+    if jump is not None and observations.ndim == 2:  # else the sizes are reported by the checks
+        jumps[:-1] = np.linalg.norm(np.diff(observations[:, :2], axis=0), axis=1) > jump
     return jumps
 
 
@@ -89,10 +113,3 @@ def _note_breaks(notes: list[str], marked: np.ndarray, breaks: np.ndarray) -> No
             f"{unmarked.sum()} episode ends are not marked, the first at row {unmarked.argmax()}: "
             "timeouts out of step; ends are taken where the state jumps as well"
         )
-
-
-def _mend_kitchen(rows: Rows) -> None:
-    sizes = (rows.observations.shape[-1], rows.actions.shape[-1])
-    if sizes == _KITCHEN_SIZES and rows.rewards is not None:
-        rows.terminals = (rows.rewards >= _KITCHEN_SOLVED).astype(np.float32)
-        rows.notes.append("no timeouts: demonstrations end at their terminals, and only four complete tasks terminate")

@@ -1,4 +1,4 @@
-"""Minari: a data set's folder or its ``main_data.hdf5``, read without Minari."""
+"""Read Minari: a data set's folder or its ``main_data.hdf5``, without Minari."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _GOAL_KEYS = {"observation", "achieved_goal", "desired_goal"}
 
 
 def main_file(folder: Path) -> Path:
-    """The file in a data set's folder that holds its episodes.
+    """Return the file in a data set's folder that holds its episodes.
 
     Raises:
         UserError: the folder is no Minari data set stored as HDF5.
@@ -34,12 +34,12 @@ def main_file(folder: Path) -> Path:
 
 
 def is_minari(file: h5py.File) -> bool:
-    """Whether the file holds groups named by episode."""
+    """Return whether the file holds groups named by episode."""
     return any(key.startswith("episode_") for key in file)
 
 
 def load(path: Path) -> Rows:
-    """The transitions of a Minari ``main_data.hdf5``; episodes have one observation more than actions.
+    """Return the transitions of a Minari ``main_data.hdf5``; episodes have one observation more than actions.
 
     Observations that are a dictionary (groups within the episode) become one vector. Of a goal-conditioned one it is
     ``observation``, preceded by ``achieved_goal`` where that is a position that ``observation`` leaves out (ant
@@ -77,7 +77,7 @@ def load(path: Path) -> Rows:
 
 
 def _episode_names(path: Path, file: h5py.File) -> list[str]:
-    """The names of all episodes in order; checks them against the metadata."""
+    """Return the names of all episodes in order; checks them against the metadata."""
     numbers = sorted(int(match[1]) for key in file if (match := re.fullmatch(r"episode_(\d+)", key)))
     expected = len(numbers)
     metadata_path = path.with_name("metadata.json")
@@ -93,7 +93,7 @@ def _episode_names(path: Path, file: h5py.File) -> list[str]:
 
 
 def _open(path: Path, file: h5py.File, name: str) -> dict[str, Any]:
-    """What an episode holds; ``observations`` may be a group."""
+    """Return what an episode holds; ``observations`` may be a group."""
     group, items = file[name], {}
     for key in (*_REQUIRED, *_STATES):
         try:
@@ -108,7 +108,7 @@ def _open(path: Path, file: h5py.File, name: str) -> dict[str, Any]:
 
 
 def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: slice) -> None:
-    """Reads an episode into its ``part`` of ``rows``, after a look at the sizes."""
+    """Read an episode into its ``part`` of ``rows``, after a look at the sizes."""
     length = part.stop - part.start
     for key in ("rewards", "terminations", "truncations"):
         shape = _set(items[key]).shape
@@ -135,7 +135,7 @@ def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: sli
 
 
 def _observations(item: Any) -> np.ndarray:
-    """[T + 1, obs] of an episode, from its ``observations``."""
+    """Return [T + 1, obs] of an episode, from its ``observations``."""
     if not isinstance(item, h5py.h5g.GroupID):
         return _flat(item)
     group = h5py.Group(item)
@@ -151,7 +151,7 @@ def _observations(item: Any) -> np.ndarray:
 
 
 def _leaves(group: h5py.Group) -> Iterator[Any]:
-    """All that is no group below ``group``, by name; parts of a tuple by number."""
+    """Yield all that is no group below ``group``, by name; parts of a tuple by number."""
     for key in sorted(group, key=lambda key: (int(key[7:]), "") if re.fullmatch(r"_index_\d+", key) else (0, key)):
         item = _item(group, key)
         if isinstance(item, h5py.h5g.GroupID):
@@ -161,18 +161,18 @@ def _leaves(group: h5py.Group) -> Iterator[Any]:
 
 
 def _item(group: h5py.Group, key: str) -> Any:
-    """What is under ``key``; HDF5's own handle, for h5py's objects take twice the time, and there are thousands."""
+    """Return HDF5's own handle of ``key``: h5py's objects take twice the time, and there are thousands."""
     return h5py.h5o.open(group.id, key.encode())
 
 
 def _flat(item: Any) -> np.ndarray:
-    """[T, numbers per row]."""
+    """Return [T, numbers per row]."""
     array = _numbers(item)
     return array.reshape(len(array), -1)
 
 
 def _numbers(item: Any) -> np.ndarray:
-    """A data set as float32."""
+    """Return a data set as float32."""
     values = _set(item)
     if values.dtype.kind not in NUMERIC:
         raise TypeError(f"{_name(item)} is not numeric ({values.dtype})")

@@ -1,4 +1,4 @@
-"""OGBench's ``.npz``: the files as published, and both layouts of OGBench's own loader if someone saved them."""
+"""Read OGBench's ``.npz``: the files as published, and both layouts of OGBench's own loader if someone saved them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _OPTIONAL = ("next_observations", "valids", "rewards", "masks", "qpos", "qvel")
 
 
 def load(path: Path) -> Rows:
-    """The transitions of an OGBench ``.npz``.
+    """Return the transitions of an OGBench ``.npz``.
 
     Published files have T + 1 rows per trajectory; the last is only a next state. ``load_dataset`` makes of them the
     regular layout (``next_observations``, T rows) or the compact one (``valids``, T + 1 rows, both of the last two
-    marked in ``terminals``). Which one it is shows in the names of the arrays.
+    marked in ``terminals``). The names of the arrays show which one it is.
 
     Raises:
         UserError: unreadable, incomplete, or sizes that do not fit.
@@ -39,7 +39,7 @@ def load(path: Path) -> Rows:
             is_next = np.roll(keep, 1)
             ends = ~np.roll(keep, -1)[keep]
             if "valids" in table and not np.array_equal(ends, marked[keep]) and not notes:
-                raise UserError(f"{path}: 'valids' and 'terminals' tell of different trajectories: the file is damaged")
+                raise UserError(f"{path}: 'valids' and 'terminals' mark different trajectories: the file is damaged")
             observations, following = table.floats("observations", keep, is_next)
         if len(ends):
             ends[-1] = True

@@ -1,4 +1,4 @@
-"""What every reader makes of a file: one transition per row, as the file has it, not yet labelled for a task."""
+"""Hold what every reader makes of a file: one transition per row, not yet labelled for a task."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SAME = 1e-4  # what two copies of a position may differ by; they went through fl
 
 @dataclass
 class Rows:
-    """N transitions in episode order, float32 and C-contiguous unless said otherwise.
+    """Hold N transitions in episode order, float32 and C-contiguous unless said otherwise.
 
     Attributes:
         observations: [N, obs].
@@ -30,8 +30,9 @@ class Rows:
         rewards: [N], the file's own, or None.
         qpos: [N, nq] before the action, or None.
         qvel: [N, nv] before the action, or None.
+        extra: int32[N, e], discrete state before the action, or None.
         quality: int8[N], what produced the step, or None.
-        notes: what the reader had to mend or leave out, one line each.
+        notes: what the reader had to correct or leave out, one line each.
     """
 
     observations: np.ndarray
@@ -42,22 +43,23 @@ class Rows:
     rewards: np.ndarray | None = None
     qpos: np.ndarray | None = None
     qvel: np.ndarray | None = None
+    extra: np.ndarray | None = None
     quality: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
 
     @property
     def size(self) -> int:
-        """Number of transitions."""
+        """Return the number of transitions."""
         return len(self.observations)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays that are there, by name."""
+        """Return the arrays that are there, by name."""
         return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
 
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turns whatever a damaged or foreign file makes the libraries raise into one clear line."""
+    """Turn whatever a damaged or foreign file makes the libraries raise into one clear line."""
     try:
         yield
     except (
@@ -79,10 +81,11 @@ def unreadable(path: Path) -> Iterator[None]:
 
 
 def after_action(path: Path, rows: Rows) -> None:
-    """Mends simulator states that were stored after the action, as D4RL's ant mazes have them, in place.
+    """Replace simulator states that were stored after the action, as D4RL's ant mazes have them, in place.
 
-    D4RL's generator steps first and stores ``infos/qpos`` then, next to the observation from before. Where the body's
-    position says so, and the observation is qpos and qvel, they are taken from there.
+    D4RL's generator steps first and stores ``infos/qpos`` then, next to the observation from before. It shows where
+    observations begin with the same two numbers as qpos: then nearly all of these numbers are those of the next
+    observation. If the observation is qpos and qvel, they are taken from there.
 
     Raises:
         UserError: the states are from after the action and the observation does not hold those from before.
@@ -105,5 +108,5 @@ def after_action(path: Path, rows: Rows) -> None:
 
 
 def _agree(qpos: np.ndarray, observations: np.ndarray) -> np.ndarray:
-    """bool[N]: the body is where the observation says; both begin with x and y in every locomotion task."""
+    """Return bool[N]: states and observations begin with the same two numbers, in mazes the body's x and y."""
     return np.abs(qpos[:, :2] - observations[:, :2]).max(axis=1) <= SAME

@@ -1,4 +1,4 @@
-"""Files as named columns that are read block by block, so that no array is in memory twice."""
+"""Read files as named columns, block by block, so that no array is in memory twice."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ CHECKSUMS = "checksums"
 """Attribute of files written here: JSON, CRC-32 of every column by name."""
 
 
-class Table(ABC):
-    """Columns of one file: ``shapes`` and ``dtypes`` by name, and the values in blocks of rows."""
+class DataTable(ABC):
+    """Read the columns of one file: ``shapes`` and ``dtypes`` by name, and the values in blocks of rows."""
 
     path: Path
     shapes: Mapping[str, tuple[int, ...]]
@@ -38,7 +38,7 @@ class Table(ABC):
 
     @abstractmethod
     def blocks(self, key: str) -> Iterator[np.ndarray]:
-        """The rows of a column in order, in its own type.
+        """Yield the rows of a column in order, in its own type.
 
         Raises:
             OSError, ValueError and their like: the values are damaged (``rows.unreadable`` knows them).
@@ -51,7 +51,7 @@ class Table(ABC):
         return self
 
     def require(self, needed: Sequence[str], known: Sequence[str]) -> int:
-        """The number of rows, after a look at the sizes.
+        """Return the number of rows, after a look at the sizes.
 
         Args:
             needed: columns that must be there.
@@ -76,7 +76,7 @@ class Table(ABC):
         return num_rows
 
     def column(self, key: str) -> np.ndarray:
-        """A column of one number per row, [N] or [N, 1], whole and in its own type.
+        """Return a column of one number per row, [N] or [N, 1], whole and in its own type.
 
         Raises:
             UserError: it has several numbers per row.
@@ -86,7 +86,7 @@ class Table(ABC):
         return np.concatenate(parts) if parts else np.zeros(0, self.dtypes[key])
 
     def numbers(self, key: str, selection: np.ndarray | None) -> np.ndarray:
-        """Such a column as float32[n], its selected rows only; raises UserError likewise."""
+        """Return such a column as float32[n], its selected rows only; raises UserError likewise."""
         self._require_one(key)
         return self.floats(key, selection)[0].reshape(-1)
 
@@ -96,7 +96,7 @@ class Table(ABC):
             raise UserError(f"{self.path}: {key!r} has {size} numbers per row, one is expected")
 
     def floats(self, key: str, *selections: np.ndarray | None) -> list[np.ndarray]:
-        """A column as float32 C-contiguous arrays, one per selection, in a single pass over the file.
+        """Return a column as float32 C-contiguous arrays, one per selection, in a single pass over the file.
 
         Args:
             key: the column.
@@ -117,8 +117,8 @@ class Table(ABC):
         return out
 
 
-class NpzTable(Table):
-    """A ``.npz``; the archive's CRC-32 of every member is verified once its last block has been taken.
+class NpzTable(DataTable):
+    """Read a ``.npz``; the archive's CRC-32 of every member is verified once its last block has been taken.
 
     Raises:
         OSError, ValueError, zipfile.BadZipFile: not an archive of arrays (``rows.unreadable`` knows them).
@@ -137,6 +137,7 @@ class NpzTable(Table):
         self._zip.close()
 
     def blocks(self, key: str) -> Iterator[np.ndarray]:
+        """Yield the rows of a column in order, the whole of it where it is stored column by column."""
         with self._zip.open(f"{key}.npy") as member:
             shape, column_major, dtype = _npy_header(member)
             num_rows = shape[0]
@@ -149,8 +150,8 @@ class NpzTable(Table):
                 raise ValueError(f"{key!r} is longer than its header says")
 
 
-class HDF5Table(Table):
-    """The data sets of an ``.hdf5``, by path within it; checksums are verified where the file has them.
+class HDF5Table(DataTable):
+    """Read the data sets of an ``.hdf5``, by path within it; checksums are verified where the file has them.
 
     Raises:
         OSError and its like: not a whole HDF5 file (``rows.unreadable`` knows them).
@@ -181,6 +182,7 @@ class HDF5Table(Table):
             self._file.close()
 
     def blocks(self, key: str) -> Iterator[np.ndarray]:
+        """Yield the rows of a column in order, whole chunks at a time."""
         values = self._sets[key]
         crc = checksum_start(values.shape, values.dtype)
         per_block = _rows_per_block(values.shape, values.dtype)
@@ -195,17 +197,17 @@ class HDF5Table(Table):
 
 
 def checksum_start(shape: Sequence[int], dtype: np.dtype) -> int:
-    """CRC-32 of a column's shape and type, which that of its bytes goes on from."""
+    """Return the CRC-32 of a column's shape and type, which that of its bytes goes on from."""
     return zlib.crc32(f"{dtype.str}{tuple(map(int, shape))}".encode())
 
 
 def checksum(array: np.ndarray) -> int:
-    """CRC-32 of a column: its shape, type and bytes."""
+    """Return the CRC-32 of a column: its shape, type and bytes."""
     return zlib.crc32(np.ascontiguousarray(array).data, checksum_start(array.shape, array.dtype))
 
 
 def stored_checksums(file: h5py.File) -> dict[str, int]:
-    """CRC-32 by column, of a file written here; empty for others.
+    """Return the CRC-32 by column, of a file written here; empty for others.
 
     Raises:
         ValueError: they are there and damaged.
@@ -223,7 +225,7 @@ def _rows_per_block(shape: Sequence[int], dtype: np.dtype) -> int:
 
 
 def _npy_header(member: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """(shape, column-major, type) at the beginning of a ``.npy``."""
+    """Return (shape, column-major, type) at the beginning of a ``.npy``."""
     version = np.lib.format.read_magic(member)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
@@ -232,7 +234,7 @@ def _npy_header(member: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def _exactly(member: Any, size: int) -> bytearray:
-    """The next ``size`` bytes."""
+    """Return the next ``size`` bytes."""
     buffer = bytearray(size)
     view, filled = memoryview(buffer), 0
     while filled < size:

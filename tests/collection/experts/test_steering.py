@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.maze import get_maze
+from envs.mazes.maze import get_maze
 from qdos_brax.collection.experts.steering import Navigator, approach, dribble_direction, maze_direction
 
 

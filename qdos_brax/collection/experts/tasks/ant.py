@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from envs import models
+from envs.mazes import models
 from envs.physics.base import PipelineState
-from envs.physics.mujoco_engine import MujocoEngine
+from envs.physics.mujoco.engine import MujocoEngine
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.tasks.base import EnvState, StepResult
 from qdos_brax.collection.experts.views import (

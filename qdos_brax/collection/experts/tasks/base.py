@@ -11,7 +11,7 @@ import jax
 from flax import struct
 
 from envs.physics.base import PipelineState
-from envs.physics.mujoco_engine import MujocoEngine
+from envs.physics.mujoco.engine import MujocoEngine
 from qdos_brax.data.transitions import Transition
 
 

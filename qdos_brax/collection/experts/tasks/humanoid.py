@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from envs import models
-from envs.locomotion import dropped_humanoid, dropped_poses
+from envs.mazes import models
+from envs.mazes.locomotion import dropped_humanoid, dropped_poses
 from envs.physics.base import PipelineState
-from envs.physics.mujoco_engine import MujocoEngine
+from envs.physics.mujoco.engine import MujocoEngine
 from qdos_brax.collection.experts import policies, symmetry
 from qdos_brax.collection.experts.poses import STANDING, humanoid_is_up, standing_humanoid
 from qdos_brax.collection.experts.tasks.base import EnvState, StepResult

@@ -1,4 +1,4 @@
-"""Mazes in which the body itself has to reach the goal."""
+"""Define the mazes in which the body itself has to reach the goal."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.bodies import ANT, HUMANOID, Body
 from envs.families import TaskSpec
-from envs.maze import get_maze
-from envs.models import humanoid_model
+from envs.mazes.bodies import ANT, HUMANOID, Body
+from envs.mazes.families import cells_of
+from envs.mazes.maze import UNIT, WALL_HALF_SIZE, get_maze
+from envs.mazes.maze_task import RESET_NOISE, MazeTask
+from envs.mazes.models import humanoid_model
 from envs.physics import PipelineState
-from envs.task import RESET_NOISE, TaskEnv
+from envs.scene import Scene, following_view, top_view
 
 DROP_HEIGHT = 1.5  # m
 
@@ -22,8 +24,11 @@ START_POSES = 4096
 """How many joint configurations the humanoid's resets are drawn from."""
 
 
-class BodyEnv(TaskEnv):
-    """A task of one of ``envs.bodies``; subclasses say which.
+_FIRST_BODY = 1  # the first body after the world: the one that walks
+
+
+class BodyTask(MazeTask):
+    """Simulate a task of one of ``envs.mazes.bodies``; subclasses say which.
 
     Args:
         spec: which task.
@@ -33,26 +38,35 @@ class BodyEnv(TaskEnv):
     body: Body
 
     def __init__(self, spec: TaskSpec, physics: str) -> None:
-        layout = get_maze(spec.maze)
+        layout = get_maze(spec.variant)
         engine = self.body.engine(physics, layout)
-        *starts, goal = spec.cells
-        super().__init__(spec, layout, engine, engine.model.qpos0, self.body.places, starts, goal)
+        tracked = dict(zip(self.body.names, self.body.places, strict=True))
+        *starts, goal = cells_of(spec)
+        super().__init__(spec, layout, engine, engine.model.qpos0, tracked, starts, goal)
 
     def whole_model(self) -> mujoco.MjModel:
-        """A fresh model with all walls and the target, as OGBench has it; the engines' own have the near walls only."""
+        """Return a fresh model with all walls and the target, as OGBench has it; the engines' have near walls only."""
         return self.body.whole(self.layout)
 
+    def scene(self) -> Scene:
+        """Return the whole maze, from above or from near the body."""
+        rows, columns = self.layout.grid.shape
+        centre = self.layout.ij_to_xy(((rows - 1) / 2, (columns - 1) / 2))
+        top = top_view(centre, (columns * UNIT / 2, rows * UNIT / 2), 2 * WALL_HALF_SIZE[2])
+        cameras = {"top": top, "follow": following_view(_FIRST_BODY)}
+        return Scene(self.whole_model(), cameras, columns / rows, goal_marker="target")
 
-class AntMaze(BodyEnv):
-    """An ant in a maze: qpos 15, qvel 14, action 8, observation 29, 10 control steps per second."""
+
+class AntMaze(BodyTask):
+    """Simulate an ant in a maze: qpos 15, qvel 14, action 8, observation 29, 10 control steps per second."""
 
     body = ANT
 
 
-class HumanoidMaze(BodyEnv):
-    """A humanoid in a maze: qpos 28, qvel 27, action 21, observation 69, 40 control steps per second.
+class HumanoidMaze(BodyTask):
+    """Simulate a humanoid in a maze: qpos 28, qvel 27, action 21, observation 69, 40 control steps per second.
 
-    The observation is xy, joint angles, and what ``envs.bodies.HUMANOID`` senses (head height, hands and feet
+    The observation is xy, joint angles, and what ``envs.mazes.bodies.HUMANOID`` senses (head height, hands and feet
     seen from the torso, the vertical as the torso sees it, velocity of the centre of mass), then qvel.
 
     A reset drops it 1.5 high, turned at random, with random joint angles that let no two parts touch. OGBench draws
@@ -66,7 +80,7 @@ class HumanoidMaze(BodyEnv):
         self._start_poses = dropped_poses()
 
     def observe(self, pipeline_state: PipelineState) -> jax.Array:
-        """float32[69], see above."""
+        """Return float32[69], see above."""
         qpos = pipeline_state.qpos
         return jnp.concatenate([qpos[:2], qpos[7:], pipeline_state.sensed, pipeline_state.qvel])
 
@@ -76,7 +90,7 @@ class HumanoidMaze(BodyEnv):
 
 
 def dropped_humanoid(key: jax.Array, poses: np.ndarray) -> jax.Array:
-    """Height, quaternion and joint angles[26] of a humanoid let fall, its angles drawn from ``poses[n, 21]``."""
+    """Return height, quaternion and joint angles[26] of a humanoid let fall, its angles drawn from ``poses[n, 21]``."""
     turn_key, angles_key = jax.random.split(key)
     quat = jax.random.uniform(turn_key, (4,))  # OGBench's: no component is ever negative
     angles = jax.random.choice(angles_key, jnp.asarray(poses))
@@ -85,7 +99,7 @@ def dropped_humanoid(key: jax.Array, poses: np.ndarray) -> jax.Array:
 
 @cache
 def dropped_poses() -> np.ndarray:
-    """float32[START_POSES, 21]: joint angles, uniform in their ranges, in which no two parts of the humanoid touch.
+    """Return float32[START_POSES, 21]: joint angles, uniform in their ranges, in which no two parts touch.
 
     At a height of 1.5 it touches nothing else, whichever way it is turned.
     """

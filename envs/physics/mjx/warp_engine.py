@@ -1,4 +1,4 @@
-"""MuJoCo Warp through MJX: NVIDIA's kernels for the sub-steps, for large batches on a CUDA device.
+"""Step with MuJoCo Warp through MJX: NVIDIA's kernels for the sub-steps, for large batches on a CUDA device.
 
 Walls, coordinates and sensors are those of ``MjxEngine``; the sub-steps are ``mjx.step`` with ``impl="warp"``: Warp's
 own contacts and solver. Against MuJoCo C a control step agrees to 1e-6 (median) in free flight; in contact, with the
@@ -21,17 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from envs.physics.integrators import Motion
-from envs.physics.mjx_engine import MjxEngine
+from envs.physics.mjx.engine import MjxEngine
+from envs.physics.mjx.integrators import Motion
 
 # Of mujoco_warp's OverflowType: constraint rows (two kinds), pairs, contacts, convex collisions; not the iterations'.
 _DROPPED = 1 | 2 | 4 | 8 | 16
 
 
 class MjxWarpEngine(MjxEngine):
-    """As ``MjxEngine``, but for the sub-steps; all ``vmap`` axes become one batch of worlds.
+    """Step as ``MjxEngine``, but for the sub-steps; all ``vmap`` axes become one batch of worlds.
 
-    It runs on a CPU too (slowly; for tests). Where it may be chosen says ``envs.physics.why_not``.
+    It runs on a CPU too (slowly; for tests). ``envs.physics.why_not`` returns where it may be chosen.
     """
 
     name = "mjx-warp"
@@ -41,27 +41,27 @@ class MjxWarpEngine(MjxEngine):
         self._warp_model = mjx.put_model(self.model, impl="warp")
         self._worlds: dict[int, mjx.Data] = {}
 
-    def _move(self, start: Motion, walls: jax.Array, action: jax.Array) -> Motion:
-        return _as_one_batch(self._move_batch)(*start, walls, action)
+    def _move(self, start: Motion, mocap: jax.Array, action: jax.Array) -> Motion:
+        return _as_one_batch(self._move_batch)(*start, mocap, action)
 
     def _move_batch(
-        self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, walls: jax.Array, action: jax.Array
+        self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, mocap: jax.Array, action: jax.Array
     ) -> Motion:
-        """All sub-steps of n worlds; arguments and results have n rows."""
+        """Make all sub-steps of n worlds; arguments and results have n rows."""
         blank = jax.tree.map(_constant, self._blank_worlds(len(qpos)))
 
         def world(
-            qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, walls: jax.Array, action: jax.Array
+            qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, mocap: jax.Array, action: jax.Array
         ) -> Motion:
-            data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, mocap_pos=walls, ctrl=action)
+            data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, mocap_pos=mocap, ctrl=action)
             data, _ = jax.lax.scan(lambda d, _: (mjx.step(self._warp_model, d), None), data, None, self.frame_skip)
             dropped = (data._impl.overflow & _DROPPED) != 0
             return jnp.where(dropped, jnp.nan, data.qpos), data.qvel, data.qacc_warmstart
 
-        return jax.vmap(world)(qpos, qvel, warmstart, walls, action)
+        return jax.vmap(world)(qpos, qvel, warmstart, mocap, action)
 
     def _blank_worlds(self, n: int) -> mjx.Data:
-        """MJX's data of one world, with buffers for ``n``, in NumPy."""
+        """Return MJX's data of one world, with buffers for ``n``, in NumPy."""
         if n not in self._worlds:
             contacts = n * self._constraints.num_pairs
             with jax.ensure_compile_time_eval():
@@ -71,14 +71,14 @@ class MjxWarpEngine(MjxEngine):
 
 
 def _constant(leaf: np.ndarray) -> jax.Array:
-    """``leaf`` inside a program; buffers that are all one number are made there, for they are large."""
+    """Return ``leaf`` inside a program; buffers that are all one number are made there, for they are large."""
     if leaf.size and (leaf == leaf.flat[0]).all():
         return jnp.full(leaf.shape, leaf.flat[0], leaf.dtype)
     return jnp.asarray(leaf)
 
 
 def _as_one_batch(batched: Callable[..., Motion]) -> Callable[..., Motion]:
-    """A function of single rows from one of n rows, that any number of ``vmap`` s call once, with all rows."""
+    """Return a function of single rows from one of n rows, that any number of ``vmap`` s call once, with all rows."""
 
     @jax.custom_batching.custom_vmap
     def rows(*args: jax.Array) -> Motion:

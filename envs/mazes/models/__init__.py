@@ -1,4 +1,4 @@
-"""MuJoCo models: the ant alone, in a maze, and with a ball, and the humanoid, built as OGBench 1.2.2 builds them."""
+"""Build MuJoCo models: the ant alone, in a maze, and with a ball, and the humanoid, as OGBench 1.2.2 builds them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import mujoco
 
-from envs.maze import TELEPORT_RADIUS, WALL_HALF_SIZE, Maze
-from envs.models.pairs import list_pairs
-from envs.physics.walls import WALLS, WALLS_AROUND
+from envs.mazes.maze import TELEPORT_RADIUS, WALL_HALF_SIZE, Maze
+from envs.mazes.walls import WALLS, WALLS_AROUND
+from envs.physics.mujoco.pairs import list_pairs
 
 _ANT = Path(__file__).with_name("ant.xml")
 _HUMANOID = Path(__file__).with_name("humanoid.xml")
@@ -19,10 +19,10 @@ _BODY_BIT, _KICK_BIT, _BALL_BIT = 1, 2, 4
 
 
 def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
-    """The model with all walls.
+    """Return the model with all walls.
 
-    Order and attributes of geoms follow OGBench (walls row by row, teleporters, the target, the ball), for contacts are
-    solved in that order and the results shall agree bit for bit.
+    Order and attributes of geoms follow OGBench (walls row by row, teleporters, the target, the ball), since
+    contacts are solved in that order and the results agree bit for bit.
 
     Args:
         maze: its walls are added; None leaves an open floor, without target.
@@ -38,7 +38,7 @@ def ant_model(maze: Maze | None = None, ball: bool = False) -> mujoco.MjModel:
 
 
 def humanoid_model(maze: Maze | None = None) -> mujoco.MjModel:
-    """The humanoid with all walls; geoms in OGBench's order, as ``ant_model``.
+    """Return the humanoid with all walls; geoms in OGBench's order, as ``ant_model``.
 
     Args:
         maze: its walls are added; None leaves an open floor, without target.
@@ -50,7 +50,7 @@ def humanoid_model(maze: Maze | None = None) -> mujoco.MjModel:
 
 
 def near_walls_ant(mocap: bool, ball: bool = False) -> mujoco.MjModel:
-    """The ant on an open floor, with the walls that can be in reach: ``WALLS`` boxes per free body, to be moved there.
+    """Return the ant on an open floor, and the walls in reach: ``WALLS`` boxes per free body, to be moved there.
 
     Args:
         mocap: the boxes are mocap bodies ("ant_wall_0", .., "ball_wall_0", ..), for MJX; else geoms of the world of
@@ -74,7 +74,7 @@ def near_walls_ant(mocap: bool, ball: bool = False) -> mujoco.MjModel:
 
 
 def near_walls_humanoid(mocap: bool) -> mujoco.MjModel:
-    """The humanoid, as ``near_walls_ant``; its parts touch each other as well."""
+    """Return the humanoid, as ``near_walls_ant``; its parts touch each other as well."""
     root = ET.parse(_HUMANOID).getroot()
     world = _find(root, "worldbody")
     if not mocap:
@@ -85,9 +85,9 @@ def near_walls_humanoid(mocap: bool) -> mujoco.MjModel:
 
 
 def _compile_for_c(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
-    """What can touch is listed beforehand (see ``envs.models.pairs``); cameras and lights go, nobody sees through them.
+    """Compile with a list of what can touch (see ``envs.physics.mujoco.pairs``), without cameras and lights.
 
-    MuJoCo's own reset of states that blow up is off: whoever steps the model shall see them. So are islands where all
+    MuJoCo's own reset of states that blow up is off, so that the task sees them. So are islands where all
     joints hang together: there is only one, and looking for it costs time and changes nothing.
     """
     _find(_find(root, "worldbody"), "geom[@name='floor']").set("conaffinity", str(floor_bits))
@@ -103,7 +103,7 @@ def _compile_for_c(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
 
 
 def _compile_for_mjx(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
-    """Only moving geoms have ``contype``: MJX collides the floor with mocap boxes, which C filters as static."""
+    """Compile with ``contype`` for moving geoms alone: MJX collides the floor with mocap boxes, C does not."""
     floor = _find(_find(root, "worldbody"), "geom[@name='floor']")
     floor.set("contype", "0")
     floor.set("conaffinity", str(floor_bits))
@@ -111,7 +111,7 @@ def _compile_for_mjx(root: ET.Element, floor_bits: int) -> mujoco.MjModel:
 
 
 def _add_world_walls(world: ET.Element, owner: str, bit: int) -> None:
-    """Boxes of the world, as a whole maze has them, so that contacts are found in the same order and bit for bit."""
+    """Add boxes of the world, as a whole maze has them, so that contacts are found in the same order, bit for bit."""
     for k in range(WALLS):
         box = {"name": f"{owner}_wall_{k}", "pos": "0 0 -100", "contype": "0", "conaffinity": str(bit)}
         _add_box(world, box)
@@ -129,7 +129,7 @@ def _add_box(parent: ET.Element, attributes: dict[str, str]) -> None:
 
 
 def _add_ball(world: ET.Element) -> ET.Element:
-    """Adds the ball's body to ``world``; returns its geom."""
+    """Add the ball's body to ``world``; return its geom."""
     body = ET.SubElement(world, "body", name="ball", pos="0 0 0.5")
     ET.SubElement(body, "freejoint", name="ball_root")
     return ET.SubElement(
@@ -164,7 +164,7 @@ def _add_walls(world: ET.Element, maze: Maze) -> None:
 
 
 def _add_teleporters(world: ET.Element, maze: Maze) -> None:
-    """Discs on the floor, for show: the task moves the body, not the physics."""
+    """Add discs on the floor, for show: the task moves the body, not the physics."""
     if maze.teleporters is None:
         return
     for kind, cells in (("in", maze.teleporters.entrances), ("out", maze.teleporters.exits)):

@@ -1,4 +1,4 @@
-"""The bodies of the tasks: which models they are stepped and drawn with."""
+"""Define the bodies of the mazes: which models they are stepped and drawn with."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from functools import partial
 
 import mujoco
 
-from envs import models
-from envs.maze import Maze
+from envs.mazes import models
+from envs.mazes.maze import Maze
+from envs.mazes.walls import MazeRig, NearWalls
 from envs.physics import Engine, MujocoEngine, Sensors
 
 
 @dataclass(frozen=True)
 class Body:
-    """What moves in a maze.
+    """Describe what moves in a maze.
 
     Attributes:
         whole: makes the model with every wall of a maze, as OGBench has it: for drawing, and to compare with.
@@ -24,6 +25,7 @@ class Body:
         places: where in qpos the x of each free body lies, the walking one first.
         most_contacts: by contact dimension, how many MJX keeps; benchmarks/exactness.py counts what that drops.
         sensors: what is observed besides qpos and qvel.
+        names: what the free bodies are called, as ``places`` has them.
     """
 
     whole: Callable[[Maze], mujoco.MjModel]
@@ -31,17 +33,19 @@ class Body:
     most_contacts: Mapping[int, int]
     places: tuple[int, ...] = (0,)
     sensors: Sensors | None = None
+    names: tuple[str, ...] = ("body",)
 
     def engine(self, physics: str, layout: Maze) -> Engine:
-        """The engine called "mjx", "mjx-warp" or "mujoco" for this body in ``layout``."""
+        """Return the engine called "mjx", "mjx-warp" or "mujoco" for this body in ``layout``."""
         if physics == "mujoco":
-            return MujocoEngine(self.near(False), layout, self.places, sensors=self.sensors)
+            model = self.near(False)
+            return MujocoEngine(model, MazeRig(model, layout, self.places, self.sensors))
         # imported here, for MJX takes seconds to load
-        from envs.physics.mjx_engine import MjxEngine
-        from envs.physics.warp_engine import MjxWarpEngine
+        from envs.physics.mjx.engine import MjxEngine
+        from envs.physics.mjx.warp_engine import MjxWarpEngine
 
         engine = {engine.name: engine for engine in (MjxEngine, MjxWarpEngine)}[physics]
-        return engine(self.near(True), layout, self.most_contacts, self.places, sensors=self.sensors)
+        return engine(self.near(True), NearWalls(layout, self.places), self.most_contacts, sensors=self.sensors)
 
 
 ANT = Body(models.ant_model, models.near_walls_ant, most_contacts={3: 8})
@@ -51,6 +55,7 @@ ANT_AND_BALL = Body(
     partial(models.near_walls_ant, ball=True),
     most_contacts={3: 8, 6: 6},
     places=(0, 15),  # the ant's 15 numbers come first
+    names=("body", "ball"),
 )
 
 HUMANOID = Body(

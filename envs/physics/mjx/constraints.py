@@ -1,4 +1,4 @@
-"""The constraints of a state: joint limits, and the contacts that are deepest, as rows for ``envs.physics.solver``.
+"""Make the constraints of a state, joint limits and the deepest contacts, as rows for ``envs.physics.mjx.solver``.
 
 MuJoCo documentation, "Computation" (constraint model), for pyramidal cones. Everything that a pair of geoms decides
 (friction, stiffness, which joints move the one against the other) is tabulated beforehand, so that a step finds the
@@ -17,11 +17,11 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
-from envs.physics.contacts import COLLIDERS
+from envs.physics.mjx.contacts import COLLIDERS
 
 
-class Rows(NamedTuple):
-    """Constraints a >= r on accelerations: rows of zeros stand for those that are not in force.
+class ConstraintRows(NamedTuple):
+    """Hold constraints a >= r on accelerations: rows of zeros stand for those that are not in force.
 
     Attributes:
         jacobian: float[n, nv].
@@ -35,7 +35,7 @@ class Rows(NamedTuple):
 
 
 class _Table(NamedTuple):
-    """What is known beforehand about C possible constraints.
+    """Hold what is known beforehand about C possible constraints.
 
     Attributes:
         margin: float[C], a distance below it puts the constraint in force.
@@ -51,7 +51,7 @@ class _Table(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """All pairs of geoms whose contacts have the same dimension, in the order in which they are collided.
+    """Hold all pairs of geoms whose contacts have the same dimension, in the order in which they are collided.
 
     Attributes:
         dimension: 1, 3, 4 or 6.
@@ -71,7 +71,7 @@ class _Pairs(NamedTuple):
 
 
 class Constraints:
-    """Makes the rows of a model.
+    """Make the rows of a model.
 
     Args:
         model: MuJoCo's model, with pyramidal cones; only its joint limits and contacts count.
@@ -92,20 +92,20 @@ class Constraints:
 
     @property
     def num_pairs(self) -> int:
-        """Pairs of geoms that could touch."""
+        """Return the number of pairs of geoms that could touch."""
         return sum(len(geoms) for pairs in self._pairs for _, geoms in pairs.groups)
 
     @property
     def most_rows(self) -> int:
-        """Rows of all joint limits and of the most contacts that are kept: a pyramid has two per tangent."""
+        """Return the number of rows of all limits and of the most contacts kept: a pyramid has two per tangent."""
         per_contact = (pairs.keep * max(1, 2 * (pairs.dimension - 1)) for pairs in self._pairs)
         return len(self._limited) + sum(per_contact)
 
-    def rows(self, data: mjx.Data) -> Rows:
-        """Of a state whose kinematics, centres of mass and ``qvel`` are in ``data``."""
+    def rows(self, data: mjx.Data) -> ConstraintRows:
+        """Return the rows of a state whose kinematics, centres of mass and ``qvel`` are in ``data``."""
         found = [self._limit_rows(data), *(self._contact_rows(data, pairs) for pairs in self._pairs)]
         jacobian, stiffness, stretch, damping = (jnp.concatenate(part) for part in zip(*found, strict=True))
-        return Rows(jacobian, stiffness, -damping * (jacobian @ data.qvel) - stretch)
+        return ConstraintRows(jacobian, stiffness, -damping * (jacobian @ data.qvel) - stretch)
 
     def _limit_rows(self, data: mjx.Data) -> tuple[jax.Array, ...]:
         model, joints = self._model, self._limited
@@ -146,20 +146,20 @@ class Constraints:
         return jacobian.reshape(-1, self._model.nv), *springs
 
     def _collide(self, data: mjx.Data, pairs: _Pairs) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Distance [C], position [C, 3] and frame [C, 3, 3] of every possible contact."""
+        """Return distance [C], position [C, 3] and frame [C, 3, 3] of every possible contact."""
         found = [COLLIDERS[key.types](self._mjx_model, data, key, geoms) for key, geoms in pairs.groups]
         distance, position, frame = (jnp.concatenate(part) for part in zip(*found, strict=True))
         return distance, position, frame
 
 
 def _along(frame: jax.Array, vectors: jax.Array) -> jax.Array:
-    """Components [k, 3, nv] of ``vectors[k, nv, 3]`` along the rows of ``frame[k, 3, 3]``."""
+    """Return components [k, 3, nv] of ``vectors[k, nv, 3]`` along the rows of ``frame[k, 3, 3]``."""
     x, y, z = (frame[:, :, i, None] * vectors[:, None, :, i] for i in range(3))
     return x + y + z
 
 
 def _spring(table: _Table, violation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Stiffness D, and the reference acceleration's two parts: from the violation, and per unit of velocity."""
+    """Return stiffness D, and the reference acceleration's two parts: from the violation, and per unit of velocity."""
     violation = jnp.minimum(violation, 0.0)
     impedance = _impedance(jnp.asarray(table.impedance), violation)
     softness = jnp.maximum(table.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
@@ -168,7 +168,7 @@ def _spring(table: _Table, violation: jax.Array) -> tuple[jax.Array, jax.Array, 
 
 
 def _impedance(solimp: jax.Array, violation: jax.Array) -> jax.Array:
-    """d(r) in (0, 1), [C], from ``solimp[C, 5]``: least, most, width, midpoint, power (sigmoid of two power laws)."""
+    """Return d(r) in (0, 1), [C], from ``solimp[C, 5]``: least, most, width, midpoint, power (two power laws)."""
     least, most, width, middle, power = solimp.T
     x = jnp.minimum(jnp.abs(violation) / width, 1.0)
     early = x**power / middle ** (power - 1)
@@ -208,13 +208,13 @@ def _tabulate_pairs(model: mujoco.MjModel, mjx_model: mjx.Model, most_contacts: 
 
 
 def _repeat(contact: mjx.Contact, times: int) -> tuple[np.ndarray, ...]:
-    """One row per contact that a collision function gives, instead of one per pair."""
+    """Return one row per contact that a collision function gives, instead of one per pair."""
     parts = (contact.geom, contact.includemargin, contact.friction, contact.solref, contact.solimp)
     return tuple(np.repeat(np.asarray(part), times, axis=0) for part in parts)
 
 
 def _carried(model: mujoco.MjModel) -> np.ndarray:
-    """float32[bodies, nv], 1 where a degree of freedom moves a body: it is the body's own, or its ancestor's."""
+    """Return float32[bodies, nv], 1 where a degree of freedom moves a body: it is the body's own, or its ancestor's."""
     carried = np.zeros((model.nbody, model.nv), np.float32)
     for body in range(1, model.nbody):
         carried[body] = carried[model.body_parentid[body]]
@@ -223,7 +223,7 @@ def _carried(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _contact_weight(model: mujoco.MjModel, bodies: np.ndarray, friction: np.ndarray, dimension: int) -> np.ndarray:
-    """float[C]: translational inverse weights of both bodies; all edges of a pyramid share one."""
+    """Return float[C]: translational inverse weights of both bodies; all edges of a pyramid share one."""
     weight = model.body_invweight0[bodies, 0].sum(axis=1)
     if dimension == 1:
         return weight
@@ -232,13 +232,13 @@ def _contact_weight(model: mujoco.MjModel, bodies: np.ndarray, friction: np.ndar
 
 
 def _allowed(solimp: np.ndarray) -> np.ndarray:
-    """``solimp[C, 5]`` within MuJoCo's bounds."""
+    """Return ``solimp[C, 5]`` within MuJoCo's bounds."""
     low, high = mujoco.mjMINIMP, mujoco.mjMAXIMP
     return np.clip(solimp, [low, low, mujoco.mjMINVAL, low, 1.0], [high, high, np.inf, high, np.inf])
 
 
 def _gains(model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray) -> np.ndarray:
-    """float[C, 2], stiffness and damping from ``solref``: (time constant, damping ratio), or both negated."""
+    """Return float[C, 2], stiffness and damping from ``solref``: (time constant, damping ratio), or both negated."""
     most = solimp[:, 1]
     least_time = 0.0 if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE else 2 * model.opt.timestep
     direct = solref[:, 0] <= 0

@@ -1,4 +1,4 @@
-"""The pairs of geoms that can touch, listed in the model, so that MuJoCo need not look for them in every step.
+"""List the pairs of geoms that can touch in the model, so that MuJoCo need not look for them in every step.
 
 MuJoCo C finds them anew each time: it sorts the bodies along an axis, and descends trees of volumes. For a body among a
 few walls that costs more than the contacts themselves. Listed pairs only pass a test of their bounding spheres. They
@@ -15,7 +15,7 @@ import numpy as np
 
 
 def list_pairs(spec: mujoco.MjSpec) -> None:
-    """Gives ``spec`` its pairs of geoms that can touch, and takes all others from MuJoCo's search (no contact bits)."""
+    """Give ``spec`` its pairs of geoms that can touch, and take all others from MuJoCo's search (no contact bits)."""
     for k, geom in enumerate(spec.geoms):
         geom.name = geom.name or f"geom_{k}"
     model = spec.compile()
@@ -27,7 +27,7 @@ def list_pairs(spec: mujoco.MjSpec) -> None:
 
 
 def _pairs_that_can_touch(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """By their bits and not welded together, nor parent and child; in MuJoCo's order of contacts.
+    """Return pairs by their bits, not welded together, nor parent and child; in MuJoCo's order of contacts.
 
     That is by the two bodies, then by the two geoms, of which the one of the lower type comes first.
     """
@@ -46,7 +46,7 @@ def _pairs_that_can_touch(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def _contact_properties(model: mujoco.MjModel, first: int, second: int) -> dict[str, Any]:
-    """What MuJoCo gives a contact of the two geoms: those of the one with priority, else the mean or the greater."""
+    """Return the contact's properties: those of the geom with priority, else the mean or the greater."""
     geoms = np.array([first, second])
     priority = model.geom_priority[geoms]
     if priority[0] != priority[1]:

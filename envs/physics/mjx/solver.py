@@ -1,4 +1,4 @@
-"""MuJoCo's constraint problem, solved to the end in a few Newton steps.
+"""Solve MuJoCo's constraint problem to the end in a few Newton steps.
 
 The acceleration x minimises
 
@@ -30,7 +30,7 @@ def solve(
     reference: jax.Array,
     guess: jax.Array,
 ) -> jax.Array:
-    """The constrained acceleration float[nv].
+    """Return the constrained acceleration float[nv].
 
     Args:
         mass: M, float[nv, nv], the joint-space inertia.
@@ -63,7 +63,7 @@ def solve(
 
 
 def solve_positive(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """The x[n] with ``matrix[n, n]`` x = ``vector[n]``, for a symmetric positive definite matrix (Cholesky, U' U)."""
+    """Return x[n] with ``matrix[n, n]`` x = ``vector[n]`` for a symmetric positive definite matrix (Cholesky, U' U)."""
     n = len(vector)
     augmented = jnp.concatenate([matrix, vector[:, None]], axis=1)  # its factor's last column is y with U' y = vector
 
@@ -83,7 +83,7 @@ def solve_positive(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 def _line_minimum(
     slope: jax.Array, curvature: jax.Array, gap: jax.Array, along: jax.Array, stiffness: jax.Array
 ) -> jax.Array:
-    """About the t > 0 where slope + t curvature + sum_i D_i along_i min(0, gap_i + t along_i) crosses zero.
+    """Return about the t > 0 where slope + t curvature + sum_i D_i along_i min(0, gap_i + t along_i) crosses zero.
 
     Newton's method from t = 1 on, which is where a Newton step of the whole problem ends if no constraint changes
     sides; within the bracket that the signs seen so far leave.

@@ -1,4 +1,4 @@
-"""Sub-steps as MuJoCo C makes them, around any function that gives the acceleration.
+"""Make sub-steps as MuJoCo C makes them, around any function that gives the acceleration.
 
 ``mjx.step`` unrolls the four stages of its Runge-Kutta method, which takes four times as long to compile, and turns
 quaternions otherwise than MuJoCo C from 4.0 on. Here all sub-steps and stages of a control step are one loop around one
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.physics.solver import solve_positive
+from envs.physics.mjx.solver import solve_positive
 
 Motion = tuple[jax.Array, jax.Array, jax.Array]
 """qpos[nq], qvel[nv], and the acceleration[nv] found last, which the next one starts from (warm start)."""
@@ -25,7 +25,7 @@ Dynamics = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Arra
 
 
 def integrate(model: mujoco.MjModel, dynamics: Dynamics, start: Motion, substeps: int) -> Motion:
-    """``substeps`` sub-steps by the integrator that the model asks for.
+    """Make ``substeps`` sub-steps by the integrator that the model asks for.
 
     Raises:
         ValueError: the model asks for another than Euler or RK4.
@@ -38,7 +38,7 @@ def integrate(model: mujoco.MjModel, dynamics: Dynamics, start: Motion, substeps
 
 
 def _euler(model: mujoco.MjModel, dynamics: Dynamics, start: Motion, substeps: int) -> Motion:
-    """Semi-implicit Euler; joint damping is implicit, as in C: (M + dt D) a' = M a."""
+    """Integrate by semi-implicit Euler; joint damping is implicit, as in C: (M + dt D) a' = M a."""
     dt = model.opt.timestep
     damping = jnp.asarray(model.dof_damping, jnp.float32)
 
@@ -56,7 +56,7 @@ _STAGES = np.array([[0.0, 1 / 6, 0], [0.5, 1 / 3, 0], [0.5, 1 / 3, 0], [1.0, 1 /
 
 
 class _Stage(NamedTuple):
-    """A Runge-Kutta sub-step under way.
+    """Hold a Runge-Kutta sub-step under way.
 
     Attributes:
         qpos: float[nq], where it began.
@@ -78,7 +78,7 @@ class _Stage(NamedTuple):
 
 
 def _runge_kutta(model: mujoco.MjModel, dynamics: Dynamics, start: Motion, substeps: int) -> Motion:
-    """RK4 as MuJoCo C from 4.0 on, which turns quaternions by Munthe-Kaas' method.
+    """Integrate by RK4 as MuJoCo C from 4.0 on, which turns quaternions by Munthe-Kaas' method.
 
     The rotation over a sub-step is the integral of the angular velocity with a correction for the change of its axis.
     (``mjx.step`` 3.17 has the plain integral, and misses C by 1e-5 to 1e-2 in a control step of the ant.) Stages and
@@ -106,7 +106,7 @@ def _runge_kutta(model: mujoco.MjModel, dynamics: Dynamics, start: Motion, subst
 
 
 def _correct_rotations(model: mujoco.MjModel, motion: jax.Array, qvel: jax.Array) -> jax.Array:
-    """``qvel[nv]`` with each free joint's angular velocity w made the rate of the rotation vector u in ``motion``.
+    """Return ``qvel[nv]``, each free joint's angular velocity w made the rate of the rotation vector u in ``motion``.
 
     The inverse derivative of the exponential map, w + [u, w] / 2 + [u, [u, w]] / 12, up to terms of fourth order.
     """
@@ -119,7 +119,7 @@ def _correct_rotations(model: mujoco.MjModel, motion: jax.Array, qvel: jax.Array
 
 
 def _move(model: mujoco.MjModel, qpos: jax.Array, motion: jax.Array) -> jax.Array:
-    """``qpos[nq]`` moved by ``motion[nv]`` (velocity times time), quaternions on their sphere."""
+    """Return ``qpos[nq]`` moved by ``motion[nv]`` (velocity times time), quaternions on their sphere."""
     parts = []
     for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
         if kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -130,7 +130,7 @@ def _move(model: mujoco.MjModel, qpos: jax.Array, motion: jax.Array) -> jax.Arra
 
 
 def _rotate(quat: jax.Array, turn: jax.Array) -> jax.Array:
-    """``quat[4]`` turned by the rotation vector ``turn[3]`` (body frame, radians), normalised."""
+    """Return ``quat[4]`` turned by the rotation vector ``turn[3]`` (body frame, radians), normalised."""
     angle = jnp.sqrt(jnp.sum(turn * turn))
     axis = turn / jnp.where(angle > 0, angle, 1.0)
     w, (x, y, z) = jnp.cos(angle / 2), axis * jnp.sin(angle / 2)

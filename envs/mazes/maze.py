@@ -1,4 +1,4 @@
-"""Maze layouts, cells and coordinates, shortest paths.
+"""Compute with mazes: cells and coordinates, shortest paths.
 
 Geometry is OGBench's: a cell is 4 x 4 units, cell (i, j) is centred at x = 4j - 4, y = 4i - 4, a wall is a box that
 fills its cell to a height of 2.
@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.mazes.layouts import LAYOUTS, TELEPORTERS, Teleporters
+
 UNIT = 4.0  # side of a cell
 OFFSET = 4.0  # cell (1, 1) is centred at the origin
 WALL_HALF_SIZE = (2.0, 2.0, 1.0)
@@ -25,77 +27,10 @@ TELEPORT_REACH = 1.5
 _EDGE = 1e-6  # a path may run along a wall; only its interior, shrunk by this much, blocks
 _CHUNK = 1 << 22  # segments times walls looked at in one go, bounds memory
 
-_LAYOUTS = {
-    "arena": """
-        11111111
-        10000001
-        10000001
-        10000001
-        10000001
-        10000001
-        10000001
-        11111111""",
-    "medium": """
-        11111111
-        10011001
-        10010001
-        11000111
-        10010001
-        10100101
-        10001001
-        11111111""",
-    "large": """
-        111111111111
-        100001000001
-        101101010101
-        100000010001
-        101111011101
-        100101000001
-        110101010111
-        100100010001
-        111111111111""",
-    "giant": """
-        1111111111111111
-        1010000001100001
-        1010110101001101
-        1000100100010001
-        1011101111110101
-        1000100010000101
-        1110101001010111
-        1000100100010001
-        1010101111110101
-        1011100010001101
-        1000001000100001
-        1111111111111111""",
-    "teleport": """
-        111111111111
-        100000101001
-        110100010011
-        110111000001
-        100001010101
-        101101010101
-        101101010101
-        100001000101
-        111111111111""",
-}
-
-
-@dataclass(frozen=True)
-class Teleporters:
-    """Cells whose middle sends a body to one of a few others.
-
-    Attributes:
-        entrances: cells at whose centre a body, nearer than ``TELEPORT_REACH``, is sent off.
-        exits: cells at whose centre it comes out, each as likely.
-    """
-
-    entrances: tuple[tuple[int, int], ...]
-    exits: tuple[tuple[int, int], ...]
-
 
 @dataclass(frozen=True, eq=False)
 class Maze:
-    """A layout and its geometry. Paths and distances are those of the walls alone: none leads through a teleporter.
+    """Hold a layout and its geometry. Paths and distances are those of the walls: none leads through a teleporter.
 
     Attributes:
         name: "arena", "medium", "large", "giant" or "teleport".
@@ -109,38 +44,38 @@ class Maze:
 
     @property
     def num_cells(self) -> int:
-        """I * J, walls included: the range of ``cell_index``."""
+        """Return I * J, walls included: the range of ``cell_index``."""
         return int(self.grid.size)
 
     @cached_property
     def free_cells(self) -> np.ndarray:
-        """int[F, 2], the (i, j) of every free cell, row by row."""
+        """Return int[F, 2], the (i, j) of every free cell, row by row."""
         return np.argwhere(self.grid == 0)
 
     def ij_to_xy(self, ij: Any) -> Any:
-        """Centres float[..., 2] of the cells ``ij[..., 2]``; NumPy in, NumPy out, jax likewise."""
+        """Return centres float[..., 2] of the cells ``ij[..., 2]``; NumPy in, NumPy out, jax likewise."""
         return _namespace(ij).asarray(ij)[..., ::-1] * UNIT - OFFSET
 
     def xy_to_ij(self, xy: Any) -> Any:
-        """Cells int[..., 2] that hold the points ``xy[..., 2]``, clipped to the grid."""
+        """Return cells int[..., 2] that hold the points ``xy[..., 2]``, clipped to the grid."""
         xp = _namespace(xy)
         ij = xp.floor((xp.asarray(xy)[..., ::-1] + OFFSET + 0.5 * UNIT) / UNIT).astype(xp.int32)
         return xp.clip(ij, 0, xp.asarray(self.grid.shape, dtype=xp.int32) - 1)
 
     def cell_index(self, xy: Any) -> Any:
-        """Row-major index int[...] of the cell that holds ``xy[..., 2]``; indexes ``next_step_table``."""
+        """Return the row-major index int[...] of the cell that holds ``xy[..., 2]``; indexes ``next_step_table``."""
         ij = self.xy_to_ij(xy)
         return ij[..., 0] * self.grid.shape[1] + ij[..., 1]
 
     def index_to_xy(self, index: Any) -> Any:
-        """Centre float[..., 2] of the cell with row-major ``index[...]``; the inverse of ``cell_index``."""
+        """Return the centre float[..., 2] of the cell with row-major ``index[...]``; the inverse of ``cell_index``."""
         xp = _namespace(index)
         columns = self.grid.shape[1]
         index = xp.asarray(index)
         return self.ij_to_xy(xp.stack([index // columns, index % columns], axis=-1))
 
     def check_free(self, ij: np.ndarray) -> None:
-        """Raises ValueError unless ``ij`` is a free cell's (i, j)."""
+        """Raise ValueError unless ``ij`` is a free cell's (i, j)."""
         if ij.shape != (2,) or not np.issubdtype(ij.dtype, np.integer):
             raise ValueError(f"a cell is two whole numbers (i, j), not {ij.tolist()!r}")
         i, j = ij.tolist()
@@ -151,7 +86,7 @@ class Maze:
             raise ValueError(f"cell ({i}, {j}) of the maze {self.name!r} is a wall; choose one of maze.free_cells")
 
     def teleport(self, xy: jax.Array, key: jax.Array) -> jax.Array:
-        """``xy[2]``, or where an entrance is in reach, an exit drawn from ``key``."""
+        """Return ``xy[2]``, or where an entrance is in reach, an exit drawn from ``key``."""
         if self.teleporters is None:
             return xy
         entrances = jnp.asarray(self.ij_to_xy(np.array(self.teleporters.entrances)), jnp.float32)
@@ -161,7 +96,7 @@ class Maze:
 
     @cached_property
     def next_step_table(self) -> np.ndarray:
-        """int32[I*J, I*J]: ``table[start, goal]``, the next free cell on a shortest 4-connected path.
+        """Return int32[I*J, I*J]: ``table[start, goal]``, the next free cell on a shortest 4-connected path.
 
         Equal to OGBench's ``get_oracle_subgoal``, ties included; ``start`` itself where it is the goal, a wall or cut
         off from the goal.
@@ -181,14 +116,14 @@ class Maze:
 
     @cached_property
     def steps_table(self) -> np.ndarray:
-        """int32[I*J, I*J]: ``table[start, goal]``, cells to go on a shortest 4-connected path, -1 without."""
+        """Return int32[I*J, I*J]: ``table[start, goal]``, cells to go on a shortest 4-connected path, -1 without."""
         table = np.full((self.num_cells, self.num_cells), -1, np.int32)
         for goal in self.free_cells:
             table[:, goal[0] * self.grid.shape[1] + goal[1]] = self._steps_to(tuple(goal)).reshape(-1)
         return table
 
     def distance(self, a: Any, b: Any) -> np.ndarray:
-        """Length of the shortest path of a point around the walls, exact (a path bends at wall corners only).
+        """Return the length of a point's shortest path around the walls, exact (a path bends at wall corners only).
 
         Args:
             a: float[..., 2], points; broadcast against ``b``. A point inside a wall is first moved to the nearest
@@ -207,7 +142,7 @@ class Maze:
         return np.minimum(straight, around).reshape(lead)
 
     def _steps_to(self, goal: tuple[int, int]) -> np.ndarray:
-        """int[I, J], number of cell steps to ``goal``, -1 for walls and cut-off cells (breadth first)."""
+        """Return int[I, J], the number of cell steps to ``goal``, -1 for walls and cut-off cells (breadth first)."""
         steps = np.full(self.grid.shape, -1)
         steps[goal] = 0
         queue = deque([goal])
@@ -220,7 +155,7 @@ class Maze:
         return steps
 
     def _to_free(self, xy: np.ndarray) -> np.ndarray:
-        """``xy[N, 2]`` with the points that lie in a wall moved to the nearest point of a free cell."""
+        """Return ``xy[N, 2]`` with the points that lie in a wall moved to the nearest point of a free cell."""
         ij = self.xy_to_ij(xy)
         inside = self.grid[ij[:, 0], ij[:, 1]] == 1
         if not inside.any():
@@ -234,7 +169,7 @@ class Maze:
 
     @cached_property
     def _inner_walls(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corners float[R, 2] of the rectangles that walls merge into along rows and columns.
+        """Return lower and upper corners float[R, 2] of the rectangles that walls merge into along rows and columns.
 
         Both directions, so that no path can slip along the seam of two touching walls; a plug closes the corner at
         which two walls touch diagonally. The outer ring is left out: no segment between two inner points crosses it.
@@ -249,7 +184,7 @@ class Maze:
         return np.concatenate([low, plugs - 2 * _EDGE]), np.concatenate([high, plugs + 2 * _EDGE])
 
     def _corner_points(self, chosen: Callable[[np.ndarray], bool]) -> np.ndarray:
-        """float[C, 2], where four cells meet whose walls (int[2, 2]) are ``chosen``."""
+        """Return float[C, 2], where four cells meet whose walls (int[2, 2]) are ``chosen``."""
         rows, columns = self.grid.shape
         points = [
             self.ij_to_xy(np.array([i, j])) - UNIT / 2
@@ -261,7 +196,7 @@ class Maze:
 
     @cached_property
     def _corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """The points float[C, 2] at which shortest paths bend, and float[C, C], path lengths between them."""
+        """Return the points float[C, 2] at which shortest paths bend, and float[C, C], path lengths between them."""
         corners = self._corner_points(lambda block: block.sum() == 1)
         lengths = self._visible_lengths(corners, corners)
         for k in range(len(corners)):  # Floyd and Warshall
@@ -269,7 +204,7 @@ class Maze:
         return corners, lengths
 
     def _around_corners(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Shortest path length with at least one bend, ``a[N or 1, 2]`` to ``b[N or 1, 2]``."""
+        """Return the shortest path length with at least one bend, ``a[N or 1, 2]`` to ``b[N or 1, 2]``."""
         corners, between = self._corners
         if len(corners) == 0:
             return np.full(max(len(a), len(b)), np.inf)
@@ -278,14 +213,14 @@ class Maze:
         return (self._visible_lengths(a, corners) + from_corner).min(axis=1)
 
     def _visible_lengths(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """float[N, M], straight distances ``a[N, 2]`` to ``b[M, 2]``, inf where a wall is between."""
+        """Return float[N, M], straight distances ``a[N, 2]`` to ``b[M, 2]``, inf where a wall is between."""
         gaps = np.linalg.norm(a[:, None] - b[None], axis=-1)
         starts = np.repeat(a, len(b), axis=0)
         ends = np.tile(b, (len(a), 1))
         return np.where(self._sees(starts, ends).reshape(gaps.shape), gaps, np.inf)
 
     def _sees(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """bool[N]: no wall's interior cuts the segment ``a[N, 2]`` to ``b[N, 2]`` (slab test)."""
+        """Return bool[N]: no wall's interior cuts the segment ``a[N, 2]`` to ``b[N, 2]`` (slab test)."""
         low, high = self._inner_walls
         free = np.ones(len(a), bool)
         if len(low) == 0:
@@ -301,29 +236,25 @@ class Maze:
         return free
 
 
-# OGBench 1.2.2's. The exit (1, 7) is a cell without a way out.
-_TELEPORTERS = {"teleport": Teleporters(entrances=((4, 6), (5, 1)), exits=((1, 7), (6, 1), (6, 10)))}
-
-
 def get_maze(name: str) -> Maze:
-    """The layout called ``name``.
+    """Return the layout called ``name``.
 
     Raises:
         ValueError: there is no such layout.
     """
-    if name not in _LAYOUTS:
-        raise ValueError(f"there is no maze {name!r}; mazes: {', '.join(_LAYOUTS)}")
-    grid = np.array([[int(c) for c in row.strip()] for row in _LAYOUTS[name].split()])
-    return Maze(name, grid, _TELEPORTERS.get(name))
+    if name not in LAYOUTS:
+        raise ValueError(f"there is no maze {name!r}; mazes: {', '.join(LAYOUTS)}")
+    grid = np.array([[int(c) for c in row.strip()] for row in LAYOUTS[name].split()])
+    return Maze(name, grid, TELEPORTERS.get(name))
 
 
 def _neighbours(i: int, j: int) -> list[tuple[int, int]]:
-    """The four neighbours in OGBench's order, which decides ties; free cells never lie on the outer ring."""
+    """Return the four neighbours in OGBench's order, which decides ties; free cells never lie on the outer ring."""
     return [(i - 1, j), (i, j - 1), (i + 1, j), (i, j + 1)]
 
 
 def _runs(row: np.ndarray) -> list[tuple[int, int]]:
-    """First and last index of every run of ones."""
+    """Return the first and last index of every run of ones."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], row, [0]])))
     return [(int(lo), int(hi) - 1) for lo, hi in zip(edges[::2], edges[1::2], strict=True)]
 

@@ -1,4 +1,4 @@
-"""Contacts as MuJoCo C finds them, where MJX (3.17) finds others.
+"""Find contacts as MuJoCo C does, where MJX (3.17) finds others.
 
 - *Plane and capsule.* C takes the capsule's axis, projected into the plane, as the contact's first tangent, however
   steep the capsule stands. MJX falls back to a fixed tangent once the *projected* axis is shorter than 0.5, that is,
@@ -34,7 +34,7 @@ _NONE = 1.0  # distance of a contact that is none
 
 
 def plane_capsule_frame(normal: jax.Array, axis: jax.Array) -> jax.Array:
-    """Contact frame float[3, 3] of a capsule on a plane.
+    """Return the contact frame float[3, 3] of a capsule on a plane.
 
     Args:
         normal: float[3], the plane's unit normal.
@@ -47,7 +47,7 @@ def plane_capsule_frame(normal: jax.Array, axis: jax.Array) -> jax.Array:
 
 
 def sphere_box(centre: Vector, radius: jax.Array, half_size: Vector) -> tuple[jax.Array, Vector, Vector]:
-    """Distance, position and normal of the contact of a sphere with a box, in the box's frame.
+    """Return distance, position and normal of the contact of a sphere with a box, in the box's frame.
 
     Args:
         centre: of the sphere.
@@ -72,7 +72,7 @@ def sphere_box(centre: Vector, radius: jax.Array, half_size: Vector) -> tuple[ja
 def capsule_box(
     centre: Vector, half_axis: Vector, radius: jax.Array, half_size: Vector
 ) -> list[tuple[jax.Array, Vector, Vector]]:
-    """Distance, position and normal of both contacts of a capsule with a box, in the box's frame.
+    """Return distance, position and normal of both contacts of a capsule with a box, in the box's frame.
 
     One at the point of the capsule's segment nearest to the box, and a second one further along, so that a capsule
     along a wall is held at two points. MuJoCo C's choice of the second, for boxes that are large against the capsule:
@@ -117,7 +117,7 @@ def capsule_box(
 
 
 def nearest_of_capsules(apart: Vector, half_axis_1: Vector, half_axis_2: Vector) -> tuple[jax.Array, jax.Array]:
-    """Where two segments are nearest: (t_1, t_2) in [-1, 1], of ``centre + t * half_axis`` on each, as C has it.
+    """Return where two segments are nearest: (t_1, t_2) in [-1, 1], of ``centre + t * half_axis`` on each, as C has it.
 
     First on the one, with the other a line, then on the other; axes that are not parallel.
 
@@ -143,7 +143,7 @@ def nearest_of_capsules(apart: Vector, half_axis_1: Vector, half_axis_2: Vector)
 
 
 def _nearest_on_segment(centre: Vector, half_axis: Vector, half_size: Vector) -> jax.Array:
-    """The t in [-1, 1] for which ``centre + t * half_axis`` is nearest to the box.
+    """Return the t in [-1, 1] for which ``centre + t * half_axis`` is nearest to the box.
 
     The derivative of half the squared distance rises with t and is linear between the values of t at which a
     coordinate enters or leaves the box's range: its root lies between two neighbouring ones.
@@ -168,14 +168,14 @@ def _nearest_on_segment(centre: Vector, half_axis: Vector, half_size: Vector) ->
 
 
 def _span(centre: jax.Array, half_axis: jax.Array, half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Between which t one coordinate of ``centre + t * half_axis`` is within the box."""
+    """Return between which t one coordinate of ``centre + t * half_axis`` is within the box."""
     slope = jnp.where(jnp.abs(half_axis) > 1e-9, half_axis, 1e-9)
     ends = (-half_size - centre) / slope, (half_size - centre) / slope
     return jnp.minimum(*ends), jnp.maximum(*ends)
 
 
 def _go(start: Vector, t: jax.Array | float, way: Vector) -> Vector:
-    """start + t way."""
+    """Return start + t way."""
     return [s + t * w for s, w in zip(start, way, strict=True)]
 
 
@@ -188,7 +188,7 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 
 def _frame(x: jax.Array, y: jax.Array, z: jax.Array) -> jax.Array:
-    """MuJoCo's contact frame [..., 3, 3] about the normal (x, y, z)[...], with its choice of tangents."""
+    """Return MuJoCo's contact frame [..., 3, 3] about the normal (x, y, z)[...], with its choice of tangents."""
     by_y = jnp.abs(y) < 0.5
     along = jnp.where(by_y, y, z)
     tangent = -x * along, jnp.where(by_y, 1.0, 0.0) - y * along, jnp.where(by_y, 0.0, 1.0) - z * along
@@ -238,12 +238,12 @@ def _collide_capsules(model: mjx.Model, data: mjx.Data, key: Any, geom: jax.Arra
 
 
 def _half_axis(model: mjx.Model, data: mjx.Data, capsule: jax.Array) -> Vector:
-    """From the centres of capsules to one end of their segments."""
+    """Return the way from the centres of capsules to one end of their segments."""
     return [model.geom_size[capsule, 1] * part for part in _components(data.geom_xmat[capsule][:, :, 2])]
 
 
 def _touching_spheres(model: mjx.Model, geom: jax.Array, centre_1: Vector, centre_2: Vector) -> Contact:
-    """One contact per pair, between spheres with the radii of ``geom[P, 2]``."""
+    """Return one contact per pair, between spheres with the radii of ``geom[P, 2]``."""
     between = _go(centre_2, -1.0, centre_1)
     gap = jnp.sqrt(_dot(between, between))
     normal = [
@@ -257,7 +257,7 @@ def _touching_spheres(model: mjx.Model, geom: jax.Array, centre_1: Vector, centr
 
 
 def _in_box(data: mjx.Data, points: jax.Array, box: jax.Array) -> tuple[list[Vector], Vector]:
-    """The rows of each box's rotation matrix, and each of ``points[P, 3]`` in its frame."""
+    """Return the rows of each box's rotation matrix, and each of ``points[P, 3]`` in its frame."""
     turn = [_components(data.geom_xmat[box][:, row]) for row in range(3)]
     offset = _components(points - data.geom_xpos[box])
     return turn, [_dot(column, offset) for column in zip(*turn, strict=True)]
@@ -270,7 +270,7 @@ def _components(vectors: jax.Array) -> Vector:
 def _to_world(
     data: mjx.Data, box: jax.Array, turn: list[Vector], found: list[tuple[jax.Array, Vector, Vector]]
 ) -> Contact:
-    """Contacts in the boxes' frames, each a component [P] per array, as MJX has them: of one pair after the other."""
+    """Return contacts in the boxes' frames, a component [P] per array, as MJX has them: one pair after the other."""
     distance = jnp.stack([contact[0] for contact in found], axis=-1)
     position = jnp.stack([jnp.stack([_dot(row, c[1]) for row in turn], axis=-1) for c in found], axis=-2)
     position = position + data.geom_xpos[box][:, None]

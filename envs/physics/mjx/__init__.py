@@ -1,0 +1,1 @@
+"""MJX: the physics on an accelerator, in jax or in MuJoCo Warp."""

@@ -1,0 +1,1 @@
+"""MuJoCo C: the exact engine, and what shapes a model for it."""

@@ -1,0 +1,132 @@
+"""MuJoCo C, stepped in threads from inside jit: the exact engine, and the fast one where there is no accelerator.
+
+One callback makes one control step of the whole batch (all ``vmap`` axes flattened). The full integration state of
+MuJoCo, warm start included, and what the rig remembers travel through jax as the bits of their float64 numbers, so that
+a rollout equals a plain loop of ``mujoco.mj_step`` bit for bit, and the callback stays a pure function of its
+arguments.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from envs.physics.base import PipelineState
+from envs.physics.mujoco.rig import Rig
+from envs.physics.mujoco.stepper import BatchStepper, with_changes
+
+
+class MujocoCarry(struct.PyTreeNode):
+    """Hold the exact state.
+
+    Attributes:
+        bits: uint32[2 * (nstate + m)], the float64 row of ``mjSTATE_INTEGRATION`` and the rig's memory, seen as pairs
+            of words.
+        fresh: bool, True after ``init``: no row was made yet, the next step starts from qpos and qvel.
+    """
+
+    bits: jax.Array
+    fresh: jax.Array
+
+
+class MujocoEngine:
+    """Step a model on all cores.
+
+    Args:
+        model: the compiled model; no activation states and no plugins.
+        rig: what connects actions, model and sensors to the task; None takes actions as controls.
+        frame_skip: sub-steps per control step.
+        threads: threads of the pool; None takes the cores this process may use.
+    """
+
+    name = "mujoco"
+
+    def __init__(
+        self, model: mujoco.MjModel, rig: Rig | None = None, frame_skip: int = 5, threads: int | None = None
+    ) -> None:
+        self.model = model
+        self.frame_skip = frame_skip
+        self._rig = rig or Rig()
+        self.nq, self.nv = model.nq, model.nv
+        self.action_size = model.nu if self._rig.action_size is None else self._rig.action_size
+        self.extra_size = self._rig.extra_size
+        self._stepper = BatchStepper(model, self._rig, frame_skip, threads)
+
+    def init(self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None) -> PipelineState:
+        """Return the state at (qpos[nq], qvel[nv], extra[e]), as after ``mj_resetData`` and ``set_state``.
+
+        There is no warm start; None takes zeros as ``extra``.
+        """
+        qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
+        extra = jnp.zeros(self.extra_size, jnp.int32) if extra is None else jnp.asarray(extra, jnp.int32)
+        memory, sensed = jnp.zeros(2 * self._rig.memory_size, jnp.uint32), jnp.zeros(self._rig.sensed_size)
+        if self._rig.memory_size or self._rig.sensed_size:
+            shapes = (_shape_of(memory), _shape_of(sensed))
+            memory, sensed = jax.pure_callback(
+                self._start_batch, shapes, qpos, qvel, extra, vmap_method="broadcast_all"
+            )
+        bits = jnp.concatenate([jnp.zeros(2 * self._stepper.nstate, jnp.uint32), memory])
+        return PipelineState(qpos, qvel, sensed, extra, MujocoCarry(bits=bits, fresh=jnp.ones((), bool)))
+
+    def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
+        """Return the state after one control step under ``action[act]`` (clamped by the model's control range).
+
+        A number of qpos or qvel that is no longer the rounding of the exact one was changed by hand, and counts.
+        """
+        discrete = (state.extra,) if self.extra_size else ()  # an empty array would cost every call microseconds
+        qpos, qvel, sensed, bits, *extra = jax.pure_callback(
+            self._step_batch,
+            tuple(map(_shape_of, (state.qpos, state.qvel, state.sensed, state.carry.bits, *discrete))),
+            state.qpos,
+            state.qvel,
+            state.carry.bits,
+            state.carry.fresh,
+            jnp.asarray(action, jnp.float32),
+            *discrete,
+            vmap_method="broadcast_all",
+        )
+        carry = MujocoCarry(bits=bits, fresh=jnp.zeros_like(state.carry.fresh))
+        return PipelineState(qpos, qvel, sensed, extra[0] if extra else state.extra, carry)
+
+    def exact_state(self, state: PipelineState) -> tuple[np.ndarray, np.ndarray]:
+        """Return the float64 (qpos[..., nq], qvel[..., nv]) behind a stepped state; for parity tests, outside jit."""
+        qpos, qvel = self._stepper.positions(_numbers(state.carry.bits))
+        return with_changes(qpos, np.asarray(state.qpos)), with_changes(qvel, np.asarray(state.qvel))
+
+    def _step_batch(
+        self, qpos: jax.Array, qvel: jax.Array, bits: jax.Array, fresh: jax.Array, action: jax.Array, *extra: jax.Array
+    ) -> tuple[np.ndarray, ...]:
+        """Make a step of the whole batch: NumPy only, since jax inside a callback can deadlock (jax issue 24255)."""
+        lead = np.shape(fresh)
+        n = int(np.prod(lead, dtype=int))
+        step = self._stepper.step(
+            _numbers(bits).reshape(n, -1),
+            np.asarray(fresh).reshape(n),
+            np.asarray(qpos).reshape(n, -1),
+            np.asarray(qvel).reshape(n, -1),
+            np.asarray(extra[0]).reshape(n, -1) if extra else np.zeros((n, 0), np.int32),
+            np.asarray(action).reshape(n, -1),
+        )
+        new_qpos, new_qvel = (values.astype(np.float32) for values in self._stepper.positions(step.exact))
+        outputs = (new_qpos, new_qvel, step.sensed, step.exact.view(np.uint32), *([step.extra] if extra else []))
+        return tuple(output.reshape(*lead, output.shape[1]) for output in outputs)
+
+    def _start_batch(self, *arrays: jax.Array) -> tuple[np.ndarray, ...]:
+        """Return what the rig remembers and senses at (qpos, qvel, extra), for the whole batch."""
+        lead = np.shape(arrays[0])[:-1]
+        n = int(np.prod(lead, dtype=int))
+        memory, sensed = self._stepper.start(*(np.asarray(array).reshape(n, array.shape[-1]) for array in arrays))
+        outputs = (np.ascontiguousarray(memory, np.float64).view(np.uint32), sensed)
+        return tuple(output.reshape(*lead, output.shape[1]) for output in outputs)
+
+
+def _shape_of(array: jax.Array) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(array.shape, array.dtype)
+
+
+def _numbers(bits: jax.Array | np.ndarray) -> np.ndarray:
+    """Return the float64[..., k] that ``bits`` (uint32[..., 2 k]) are."""
+    return np.ascontiguousarray(np.asarray(bits)).view(np.float64)

@@ -1,0 +1,128 @@
+"""Step batches of simulations in threads: NumPy in, NumPy out."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from envs.physics.mujoco.rig import Rig
+
+INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+class BatchStep(NamedTuple):
+    """Hold n simulations after a control step.
+
+    Attributes:
+        exact: float64[n, nstate + m], rows of ``mjSTATE_INTEGRATION``, and after them the rig's memory.
+        extra: int32[n, e], the discrete state.
+        sensed: float32[n, k], what the rig reads of the state.
+    """
+
+    exact: np.ndarray
+    extra: np.ndarray
+    sensed: np.ndarray
+
+
+class BatchStepper:
+    """Step any number of simulations of a model; several threads may call it at once.
+
+    Args:
+        model: the compiled model; no activation states and no plugins.
+        rig: what connects actions, model and sensors to the task.
+        frame_skip: sub-steps per control step.
+        threads: threads of a batch; None takes the cores this process may use.
+    """
+
+    def __init__(self, model: mujoco.MjModel, rig: Rig, frame_skip: int, threads: int | None = None) -> None:
+        self.nstate = mujoco.mj_stateSize(model, INTEGRATION)
+        self._model, self._rig, self._frame_skip = model, rig, frame_skip
+        self._positions = slice(1, 1 + model.nq)
+        self._velocities = slice(1 + model.nq, 1 + model.nq + model.nv)
+        self._threads = threads or len(os.sched_getaffinity(0))
+        self._rest = _rest_row(model)
+        self._idle: dict[int, list[Batch]] = defaultdict(list)
+
+    def start(self, qpos: np.ndarray, qvel: np.ndarray, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rig's (memory float64[n, m], sensed float32[n, k]) at rest rows with (qpos, qvel, extra)."""
+        with self._batch(len(qpos)) as batch:
+            batch.state[:] = self._rest
+            batch.bind("qpos")[:] = qpos
+            batch.bind("qvel")[:] = qvel
+            batch.forward(stage=int(self._rig.stage))
+            return self._rig.start(batch, extra)
+
+    def step(
+        self,
+        exact: np.ndarray,
+        fresh: np.ndarray,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        extra: np.ndarray,
+        action: np.ndarray,
+    ) -> BatchStep:
+        """Return n simulations after one control step.
+
+        Args:
+            exact: float64[n, nstate + m], as the last step returned it.
+            fresh: bool[n], where no step was made yet: there the row starts from rest, qpos and qvel.
+            qpos: float32[n, nq]; a number that is no longer the rounding of the exact one was changed by hand, and
+                counts.
+            qvel: float32[n, nv], likewise.
+            extra: int32[n, e].
+            action: float32[n, act].
+        """
+        rig, memory = self._rig, exact[:, self.nstate :]
+        with self._batch(len(exact)) as batch:
+            np.copyto(batch.state, exact[:, : self.nstate])
+            batch.state[fresh] = self._rest
+            for name, values in (("qpos", qpos), ("qvel", qvel)):
+                held = batch.bind(name)
+                held[:] = np.where(fresh[:, None], values, with_changes(held, values))
+            # A state that is not finite stays as it is, for the task to see; MuJoCo would spend long on it.
+            sound = np.isfinite(batch.state).all(axis=1)
+            rig.before(batch, extra)
+            qpos_before = batch.bind("qpos").copy()
+            batch.bind("ctrl")[:] = rig.ctrl(qpos_before, batch.bind("qvel"), memory, extra, action)
+            ids = None if sound.all() else np.flatnonzero(sound)
+            batch.step(ids=ids, nstep=self._frame_skip, stage=int(rig.stage))
+            rows = np.empty_like(exact)
+            rows[:, self.nstate :], extra, sensed = rig.after(batch, qpos_before, memory, extra)
+            rows[:, : self.nstate] = batch.state
+        return BatchStep(rows, extra, sensed)
+
+    def positions(self, exact: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the float64 views (qpos[..., nq], qvel[..., nv]) of ``exact[..., nstate + m]``."""
+        return exact[..., self._positions], exact[..., self._velocities]
+
+    @contextmanager
+    def _batch(self, n: int) -> Iterator[Batch]:
+        """Yield a batch of n that no other thread uses: programs on several devices call the engine at once."""
+        try:
+            batch = self._idle[n].pop()
+        except IndexError:
+            batch = Batch(self._model, nsim=n, nthread=min(self._threads, n))
+            for name in self._rig.fields:  # a field is filled from the first call after it was bound
+                batch.bind(name)
+        yield batch
+        self._idle[n].append(batch)
+
+
+def with_changes(exact: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return ``exact`` (float64), but ``values`` (float32) where they are not its rounding."""
+    return np.where(exact.astype(np.float32) == values, exact, values)
+
+
+def _rest_row(model: mujoco.MjModel) -> np.ndarray:
+    """Return float64[nstate], the integration state of a freshly made MjData."""
+    data = mujoco.MjData(model)
+    row = np.empty(mujoco.mj_stateSize(model, INTEGRATION))
+    mujoco.mj_getState(model, data, row, INTEGRATION)
+    return row
