@@ -23,15 +23,15 @@ from qdos_brax import config as configs
 from qdos_brax.collection import default_set
 from qdos_brax.data import formats, quality
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.data.device import DeviceData, macro_rows, to_device
+from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
-from qdos_brax.methods.build import value_phase
+from qdos_brax.methods.build import make_skill_model, value_phase
 from qdos_brax.population.members import Population
 from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.segment_weights import LatentWeights, SegmentBatch
 from qdos_brax.skills.skill_phase import SkillPhase
-from qdos_brax.skills.vae import Segments, SkillModel
+from qdos_brax.skills.vae import Segments
 from qdos_brax.skills.value_phase import ValuePhase, over_rows
 from qdos_brax.skills.values import IQL
 from qdos_brax.skills.weights import advantage_weights, scaled_advantage
@@ -50,9 +50,9 @@ class Scores(NamedTuple):
 
 def run_phase(phase: Any, seed: int, artifacts: dict[str, Any]) -> Any:
     """Run all chunks of a phase and return its last state."""
-    state = phase.init(jax.random.split(jax.random.key(seed), 1), artifacts)
+    state, constants = phase.init(jax.random.split(jax.random.key(seed), 1), artifacts)
     for _ in range(phase.num_chunks):
-        state, _ = phase.chunk(state)
+        state, _ = phase.chunk(state, constants)
     return jax.block_until_ready(state)
 
 
@@ -68,7 +68,8 @@ def scores(
         chosen = configs.replace(config, **{"skills.advantage": name})
         if name == "transition" or not found:  # segment and latent share their values
             started = time.perf_counter()
-            phase = value_phase(chosen, env, dataset, data, population)
+            phase = value_phase(chosen, env, dataset.ends)
+            phase.bind(population, data)
             state = run_phase(phase, seed, {})
             artifacts = phase.finish(state, {})
             seconds = time.perf_counter() - started
@@ -103,17 +104,19 @@ def latent_scores(
 ) -> np.ndarray:
     """Return Q(s_0, z) - V(s_0) of every segment, with Q trained along in a skill phase without rollouts."""
     skills = config.skills
-    model = SkillModel(env.observation_size, env.action_size, skills.latent_dim, skills.encoder_hidden,
-                       skills.encoder_layers, skills.decoder_hidden, skills.prior_hidden)  # fmt: skip
+    model = make_skill_model(config, env)
     weights = LatentWeights(env.observation_size, skills.latent_dim, config.values.hidden, skills.advantage_scale)
-    learned = run_phase(SkillPhase(config, data, population, model, weights, None), seed, artifacts)
+    phase = SkillPhase(config, model, weights, None)
+    phase.bind(population, data)
+    learned = run_phase(phase, seed, artifacts)
     learned = jax.tree.map(lambda x: x[0], learned)
 
     @jax.jit
     def latent(index: jax.Array) -> jax.Array:
-        rows = macro_rows(data, data.starts[index], skills.horizon, population.hyper["values.discount"][0])
         segments = Segments(*window((data.observations, data.actions), data.starts[index], skills.horizon))
-        batch = SegmentBatch(index, rows, lambda: model.encode(learned.params, segments).mean)
+        batch = SegmentBatch(
+            index, data.observations[data.starts[index]], lambda: model.encode(learned.params, segments).mean
+        )
         return weights.smaller_head(learned.weights, batch)
 
     total = data.starts.shape[0]

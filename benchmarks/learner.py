@@ -30,9 +30,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from qdos_brax.config import HighLevelConfig, SkillsConfig
+from qdos_brax.data.transitions import Transition
 from qdos_brax.files import write_text
 from qdos_brax.high_level import replay as replay_buffer
-from qdos_brax.high_level.sac import SAC, Batch, SACHyper
+from qdos_brax.high_level.sac import SAC, SACHyper
 from qdos_brax.nn.networks import (
     DiagonalGaussian,
     gaussian_kl,
@@ -54,12 +56,12 @@ Calls = Callable[[], int]  # does some work, waits for it, and says how many upd
 # --- SAC ---------------------------------------------------------------------------------------------------------
 
 
-def transitions() -> Batch:
+def transitions() -> Transition:
     """Made-up rows, NumPy."""
     random = np.random.default_rng(0)
     normal = lambda *shape: random.standard_normal(shape).astype(np.float32)  # noqa: E731
     action = np.tanh(normal(ROWS, LATENT))
-    return Batch(
+    return Transition(
         normal(ROWS, OBSERVATION),
         action,
         -np.ones(ROWS, np.float32),
@@ -153,7 +155,7 @@ def reference_sac(width: int) -> Calls:
         updates, new = optimiser.update(gradient, opt_state[name])
         return parameters | {name: optax.apply_updates(parameters[name], updates)}, opt_state | {name: new}
 
-    def critic_step(carry: Any, given: tuple[Batch, jax.Array]) -> tuple[Any, jax.Array]:
+    def critic_step(carry: Any, given: tuple[Transition, jax.Array]) -> tuple[Any, jax.Array]:
         (parameters, opt_state), (batch, key) = carry, given
         action_key, subset_key = jax.random.split(key)
         action, _ = tanh_gaussian_sample(action_key, *actor.apply(parameters["actor"], batch.next_observation))
@@ -170,7 +172,7 @@ def reference_sac(width: int) -> Calls:
         return (parameters | {"target": target}, opt_state), found
 
     @jax.jit
-    def update(parameters: Any, opt_state: Any, batches: Batch, key: jax.Array) -> tuple[Any, Any]:
+    def update(parameters: Any, opt_state: Any, batches: Transition, key: jax.Array) -> tuple[Any, Any]:
         critic_key, actor_key = jax.random.split(key)
         keys = jax.random.split(critic_key, UTD)
         (parameters, opt_state), _ = jax.lax.scan(critic_step, (parameters, opt_state), (batches, keys))
@@ -191,7 +193,7 @@ def reference_sac(width: int) -> Calls:
     def calls() -> int:
         index = random.integers(0, ROWS, (UTD, BATCH))
         held[2] += 1
-        batches = Batch(*(field[index] for field in rows))
+        batches = Transition(*(field[index] for field in rows))
         held[:2] = jax.block_until_ready(update(held[0], held[1], batches, jax.random.key(held[2])))
         return UTD
 
@@ -200,7 +202,7 @@ def reference_sac(width: int) -> Calls:
 
 def our_sac(width: int) -> Calls:
     """As ``OnlinePhase`` makes them, without what labels and acts."""
-    sac = SAC(OBSERVATION, LATENT, (width,) * 3, CRITICS, 1)
+    sac = SAC(OBSERVATION, LATENT, HighLevelConfig(hidden=(width,) * 3, ensemble=CRITICS, target_subset=1))
     hyper = SACHyper(RATE, DISCOUNT, TARGET_RATE, -LATENT / 2)
     rows = jax.tree.map(jnp.asarray, transitions())
     replay = replay_buffer.Replay(rows, jnp.zeros((), jnp.int32), jnp.full((), ROWS, jnp.int32))
@@ -274,7 +276,7 @@ def reference_vae() -> Calls:
 
 def our_vae() -> Calls:
     """``SkillModel``'s loss and step, every weight 1, without the mutual information."""
-    model, segments = SkillModel(OBSERVATION, ACTION, LATENT, 256, 2, (256, 256), (256, 256)), windows()
+    model, segments = SkillModel(OBSERVATION, ACTION, SkillsConfig(latent_dim=LATENT)), windows()
     parameters = model.init(jax.random.key(0))
 
     @jax.jit

@@ -13,7 +13,7 @@ import envs
 from envs import render
 from qdos_brax import config as configs
 from qdos_brax.high_level.sac import SAC
-from qdos_brax.methods import build
+from qdos_brax.methods.build import make_skill_model
 from qdos_brax.runs.checkpoint import CheckpointStore, Position
 from qdos_brax.runs.folder import RunFolder
 
@@ -42,9 +42,9 @@ def finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(envs.Task, "episode_length", 25)
     given = {"seed": (0, 1), "physics": "mujoco", "skills.horizon": 10}
     config = configs.load_config("antmaze-medium", "smoke", given, [])
-    env, high = envs.make(config.env, physics="mujoco"), config.high_level
-    model = build._skill_model(config, env)
-    sac = SAC(env.observation_size, config.skills.latent_dim, high.hidden, high.ensemble, high.target_subset)
+    env = envs.make(config.env, physics="mujoco")
+    model = make_skill_model(config, env)
+    sac = SAC(env.observation_size, config.skills.latent_dim, config.high_level)
 
     def member(key: jax.Array) -> dict:
         normaliser = {"mean": jnp.zeros(29), "scale": jnp.ones(29)}

@@ -10,6 +10,7 @@ from flax import struct
 
 from qdos_brax import config as configs
 from qdos_brax.data.dataset import Dataset
+from qdos_brax.population.members import Population
 
 STEP = 0.1
 GOAL = np.array([1.0, 0.0], np.float32)
@@ -103,3 +104,23 @@ def point_config(**values) -> configs.Config:
         "eval.every_env_steps": 100,
     }
     return configs.load_config("antmaze-medium", "smoke", small | values)
+
+
+def bound(phase, config, data):
+    """``phase`` with its programs compiled for the members of ``config`` on ``data``."""
+    phase.bind(Population(configs.population_hyper(config)), data)
+    return phase
+
+
+def run_phase(phase, keys, artifacts):
+    """(state, metrics of every chunk, artifacts) of a whole phase."""
+    (state, constants), history = phase.init(keys, artifacts), []
+    for _ in range(phase.num_chunks):
+        state, metrics = phase.chunk(state, constants)
+        history.append(metrics)
+    return state, history, phase.finish(state, artifacts)
+
+
+def first_member(tree):
+    """One member's part of a tree with a leading member axis."""
+    return jax.tree.map(lambda x: x[0], tree)

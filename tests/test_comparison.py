@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -51,7 +52,9 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(experiment, "_default_data", lambda config, env: data)
     monkeypatch.setattr(experiment.formats, "read", lambda path, env: None)
+    monkeypatch.setattr(experiment, "build_context", lambda config, env, dataset: SimpleNamespace(data=None))
     monkeypatch.setattr(experiment, "build_phases", phases)
+    monkeypatch.setattr(experiment, "bind_phases", lambda *args: None)
     monkeypatch.setattr(
         experiment, "plan_members", lambda *args: memory.MemoryPlan((jax.local_devices()[0],), 1, False, "toys")
     )

@@ -76,6 +76,12 @@ class MazeRig(Rig):
             self.fields = ("xpos", "xmat", "sensordata")
             self.stage = mujoco.mjtStage.mjSTAGE_VEL
 
+    def identity(self) -> bytes:
+        """Return the class, the walls in reach of each place, the bodies and the sensors."""
+        arrays = (self._wall_geoms, self._corner, self._quarters, self._centres)
+        content = b"".join(repr((array.shape, array.dtype)).encode() + array.tobytes() for array in arrays)
+        return super().identity() + content + repr((self._bodies, self._sensors)).encode()
+
     def before(self, batch: Batch, extra: np.ndarray) -> None:
         """Move each body's boxes to the walls around it; those without a wall stay out of reach."""
         qpos = batch.bind("qpos")

@@ -98,12 +98,12 @@ class OnlinePhase(MemberPhase):
 
     def chunk(self, state: OnlinePhaseState, constants: Any) -> tuple[OnlinePhaseState, dict[str, Any]]:
         """Make some iterations, and an evaluation when one is due (always after the last chunk)."""
-        state, info = self._chunk(state, constants, self._hyper, self._data)
+        state, info = self._chunk(state, constants, self.hyper, self.data)
         found = jax.tree.map(np.asarray, info)
         chunk = int(state.chunk[0])
         if chunk % self._evaluate_every == 0 or chunk == self.num_chunks:
             started = time.perf_counter()
-            state, episodes = self._evaluate(state, constants, self._hyper, self._data)
+            state, episodes = self._evaluate(state, constants, self.hyper, self.data)
             found |= summary(episodes) | {"eval_seconds": time.perf_counter() - started}
         return state, self.metrics(state, found)
 

@@ -94,7 +94,7 @@ class OfflinePhase(MemberPhase):
             started = time.perf_counter()
             # A key that no update uses, so that evaluating does not change what is learned.
             keys = jax.vmap(jax.random.fold_in)(state.key, state.update)
-            episodes = self._evaluate(self._learner.params(state.learner), keys, self._data)
+            episodes = self._evaluate(self._learner.params(state.learner), keys, self.data)
             metrics |= summary(episodes) | {"eval_seconds": time.perf_counter() - started}
         return state, metrics
 

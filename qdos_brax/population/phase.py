@@ -35,7 +35,7 @@ class MemberPhase:
             population: the members.
             data: the data set on the population's devices.
         """
-        self._hyper, self._data = population.hyper, data
+        self.hyper, self.data = population.hyper, data
         self._start = population.program(self.start_member)
         self._chunk = population.program(self.train_member, carries=True)
 
@@ -46,17 +46,17 @@ class MemberPhase:
             key: typed keys[members], for this phase alone.
             artifacts: what ``finish`` of the phase before returned.
         """
-        state = self._start(key, self._hyper, None)
+        state = self._start(key, self.hyper, None)
         return state.replace(healthy=health.inherited(artifacts, len(key))), self.constants(artifacts)
 
     def chunk(self, state: Any, constants: Any) -> tuple[Any, dict[str, Any]]:
         """Return the state after one chunk, and its metrics; ``state`` is donated."""
-        state, info = self._chunk(state, constants, self._hyper, self._data)
+        state, info = self._chunk(state, constants, self.hyper, self.data)
         return state, self.metrics(state, jax.tree.map(np.asarray, info))
 
     def working_bytes(self, state: Any, constants: Any) -> int:
         """Return the bytes that a chunk needs beside its arguments, which may be shapes alone."""
-        return working_bytes(self._chunk, state, constants, self._hyper, self._data)
+        return working_bytes(self._chunk, state, constants, self.hyper, self.data)
 
     def metrics(self, state: Any, info: dict[str, np.ndarray]) -> dict[str, Any]:
         """Return the columns of metrics.csv after a chunk, [members] each, from what ``train_member`` returned."""

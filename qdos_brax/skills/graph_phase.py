@@ -34,15 +34,15 @@ class GraphPhase(MemberPhase):
 
     def bind(self, population: Population, data: DeviceData) -> None:
         """Keep the data and the number of members; there is nothing to compile."""
-        self._data, self._members = data, population.members
+        self.data, self._members = data, population.members
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[jax.Array, dict[str, Any]]:
         """Return float32[members, N], the value of every logged state, yet to be found, and no constants."""
-        return jnp.zeros((self._members, self._data.rewards.shape[0])), {}
+        return jnp.zeros((self._members, self.data.rewards.shape[0])), {}
 
     def chunk(self, state: jax.Array, constants: dict[str, Any]) -> tuple[jax.Array, dict[str, np.ndarray]]:
         """Return the values: minus the cost of the way to success."""
-        costs = graph_costs(self._values, self._skills.horizon, self._data, self._ends)
+        costs = graph_costs(self._values, self._skills.horizon, self.data, self._ends)
         found = {"update": np.ones(self._members), "cost_to_go": np.full(self._members, costs.mean())}
         return jnp.tile(-jnp.asarray(costs), (self._members, 1)), found
 
@@ -58,8 +58,8 @@ class GraphPhase(MemberPhase):
         """
         value = state[0]
         following = jnp.where(self._ends, value, jnp.roll(value, -1))
-        costs = jnp.asarray(step_costs(np.asarray(self._data.rewards)), value.dtype)
-        endless = self._data.replace(rewards=-costs, masks=jnp.ones_like(costs))
+        costs = jnp.asarray(step_costs(np.asarray(self.data.rewards)), value.dtype)
+        endless = self.data.replace(rewards=-costs, masks=jnp.ones_like(costs))
         advantage = segment_advantages(value, following, endless, self._skills.horizon, jnp.ones(()))
         scaled = scaled_advantage(advantage, self._skills.advantage_scale)
         return artifacts | {"advantage": jnp.tile(scaled, (self._members, 1))}

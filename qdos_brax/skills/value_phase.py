@@ -54,7 +54,7 @@ class ValuePhase(MemberPhase):
 
     def finish(self, state: ValuePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Return the artifacts with the scaled advantage of every segment, float32[members, S]."""
-        advantage = self._advantages(state, self._hyper, self._data)
+        advantage = self._advantages(state, self.hyper, self.data)
         return artifacts | {"advantage": advantage, health.KEY: state.healthy}
 
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> ValuePhaseState:

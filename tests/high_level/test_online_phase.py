@@ -1,4 +1,4 @@
-"""Phase 2 on the plane: it finds the goal, learns from what it should, and repeats."""
+"""The online phase on the plane: it finds the goal, learns from what it should, and repeats."""
 
 import jax
 import jax.numpy as jnp
@@ -6,59 +6,56 @@ import numpy as np
 import pytest
 
 from qdos_brax import config as configs
-from qdos_brax.data.device import MacroRows, to_device
+from qdos_brax.data.device import to_device
+from qdos_brax.data.transitions import Transition
+from qdos_brax.high_level.learning import Sources
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.labels.bonus import NoBonus, RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
-from qdos_brax.population.members import Population
 from qdos_brax.skills.low_level import TrajectorySkills
 from qdos_brax.skills.segment_weights import UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.vae import SkillModel
-from tests.point import PointEnv, point_config, point_dataset
+from tests.point import PointEnv, bound, first_member, point_config, point_dataset, run_phase
 
+SIZES = configs.SkillsConfig(
+    latent_dim=2, encoder_hidden=16, encoder_layers=1, decoder_hidden=(32, 32), prior_hidden=(32, 32)
+)
 SKILLS = {"skills.updates": 600, "skills.learning_rate": 3e-3, "skills.kl_weight": 0.01}
 
 
 @pytest.fixture(scope="module")
 def plane():
-    """(data, normaliser, source, artifacts of one member with trained skills and labels)."""
+    """(data, normaliser, low-level policy, artifacts of one member with trained skills and labels)."""
     config = point_config(**SKILLS)
     data, normaliser = to_device(point_dataset(), config.skills.horizon)
-    population = Population(configs.population_hyper(config))
-    model = SkillModel(2, 2, config.skills.latent_dim, 16, 1, (32, 32), (32, 32))
+    model = SkillModel(2, 2, SIZES)
     seeds = np.zeros(1, np.uint32)
-    artifacts = run(SkillPhase(config, data, population, model, UniformWeights(), None), phase_keys(seeds, 0), {})
-    source = TrajectorySkills(model, config.high_level.latent_map)
-    artifacts = run(LabelPhase(config, data, population, source), phase_keys(seeds, 1), artifacts)
-    return data, normaliser, source, artifacts
+    skill_phase = bound(SkillPhase(config, model, UniformWeights(), None), config, data)
+    low_level = TrajectorySkills(model, config.high_level.latent_map)
+    label_phase = bound(LabelPhase(config.skills.horizon, len(data.starts), low_level), config, data)
+    _, _, artifacts = run_phase(skill_phase, phase_keys(seeds, 0), {})
+    _, _, artifacts = run_phase(label_phase, phase_keys(seeds, 1), artifacts)
+    return data, normaliser, low_level, artifacts
 
 
 def online_phase(plane, config, labeller=None, bonus=None):
     """(phase, artifacts, keys) for the members of ``config``, on the shared skills."""
-    data, normaliser, source, artifacts = plane
-    population = Population(configs.population_hyper(config))
+    data, normaliser, low_level, artifacts = plane
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
-    bonus = bonus or RNDBonus(RND(2 + source.width, config.labels.rnd_hidden, config.labels.rnd_features))
+    bonus = bonus or RNDBonus(RND(2 + low_level.width, config.labels.rnd_hidden, config.labels.rnd_features))
     labeller = labeller or DataReward()
-    phase = OnlinePhase(config, PointEnv(), data, normaliser, population, source, labeller, bonus, steps_per_chunk=100)
+    phase = OnlinePhase(config, PointEnv(), normaliser, low_level, labeller, bonus, steps_per_chunk=100)
     repeated = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), artifacts)
-    return phase, repeated, phase_keys(seeds, 2)
+    return bound(phase, config, data), repeated, phase_keys(seeds, 2)
 
 
 def phase_keys(seeds, phase):
     """Typed keys[members], fresh arrays for every phase: a phase donates what it is given."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), phase))(seeds)
-
-
-def run(phase, keys, artifacts):
-    state = phase.init(keys, artifacts)
-    for _ in range(phase.num_chunks):
-        state, _ = phase.chunk(state)
-    return phase.finish(state, artifacts)
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +74,8 @@ def trained(plane):
         },
     )
     phase, artifacts, keys = online_phase(plane, config)
-    state = phase.init(keys, artifacts)
-    history = []
-    for _ in range(phase.num_chunks):
-        state, metrics = phase.chunk(state)
-        history.append(metrics)
-    return phase, state, history, artifacts
+    state, history, _ = run_phase(phase, keys, artifacts)
+    return phase, state, history, artifacts, config
 
 
 @pytest.fixture(scope="module")
@@ -92,22 +85,22 @@ def pair(plane):
 
 
 def test_the_high_level_learns_to_reach_the_goal(trained):
-    _, _, history, _ = trained
+    _, _, history, _, _ = trained
     evaluations = [float(m["eval/success"][0]) for m in history if "eval/success" in m]
     assert len(evaluations) >= 3
     assert evaluations[-1] >= 0.9, evaluations
 
 
 def test_first_goal_and_counts_are_kept(trained):
-    phase, state, history, _ = trained
+    _, state, history, _, config = trained
     first = float(history[-1]["first_goal_step"][0])
     assert 0 < first <= float(history[-1]["env_steps"][0])
-    assert int(state.replay.size[0]) <= phase._config.high_level.replay_capacity
-    assert bool(state.healthy[0]) and int(state.broken[0]) == 0
+    assert int(state.acting.replay.size[0]) <= config.high_level.replay_capacity
+    assert bool(state.healthy[0]) and int(state.acting.broken[0]) == 0
 
 
 def test_success_in_training_is_the_share_of_the_episodes_that_ended(trained):
-    _, _, history, _ = trained
+    _, _, history, _, _ = trained
     shares = np.array([float(m["train/success"][0]) for m in history])
     ended = shares[~np.isnan(shares)]
     assert len(ended) and (ended >= 0).all() and (ended <= 1).all()
@@ -117,19 +110,18 @@ def test_success_in_training_is_the_share_of_the_episodes_that_ended(trained):
 
 
 def test_a_phase_is_traced_once(trained):
-    phase, _, _, _ = trained
+    phase, _, _, _, _ = trained
     assert phase._chunk._cache_size() == 1
 
 
 def test_the_batch_is_half_offline_and_half_online(trained):
-    phase, state, _, artifacts = trained
-    member = jax.tree.map(lambda x: x[0], state)
-    frozen = {"skills": None, "labels": artifacts["labels"][0]}
-    hyper = {key: value[0] for key, value in phase._hyper.items()}
-    batch = phase._sample(member.learners, member.replay, jax.random.key(0), frozen=frozen, hyper=hyper,
-                          data=phase._data)  # fmt: skip
-    online = np.asarray(member.replay.data.observation[: int(member.replay.size)])
-    offline = np.asarray(phase._data.observations)
+    phase, state, _, artifacts, _ = trained
+    member = first_member(state)
+    replay = member.acting.replay
+    sources = Sources(replay, phase.data, None, artifacts["labels"][0], first_member(phase.hyper))
+    batch = phase.learning.sample(member.learners, jax.random.key(0), sources)
+    online = np.asarray(replay.data.observation[: int(replay.size)])
+    offline = np.asarray(phase.data.observations)
     half = len(batch.observation) // 2
     first, second = np.asarray(batch.observation[:half]), np.asarray(batch.observation[half:])
     assert all((row == offline).all(axis=1).any() for row in first)
@@ -140,7 +132,7 @@ def test_seeds_differ_and_repeat(pair):
     phase, artifacts, keys = pair
     results = []
     for _ in range(2):
-        state, _ = phase.chunk(phase.init(keys, artifacts))
+        state, _ = phase.chunk(*phase.init(keys, artifacts))
         results.append([np.asarray(leaf) for leaf in jax.tree.leaves(state.learners.sac.actor)])
     for a, b in zip(*results, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -149,11 +141,11 @@ def test_seeds_differ_and_repeat(pair):
 
 def test_a_member_that_diverges_is_frozen_and_the_other_is_as_without_it(pair):
     phase, artifacts, keys = pair
-    alone, _ = phase.chunk(phase.init(keys, artifacts))
-    state = phase.init(keys, artifacts)
+    alone, _ = phase.chunk(*phase.init(keys, artifacts))
+    state, constants = phase.init(keys, artifacts)
     broken = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.learners.sac.critic)
     learners = state.learners.replace(sac=state.learners.sac.replace(critic=broken))
-    after, metrics = phase.chunk(state.replace(learners=learners))
+    after, metrics = phase.chunk(state.replace(learners=learners), constants)
     np.testing.assert_array_equal(metrics["status_ok"], [True, False])
     leaves = zip(jax.tree.leaves(alone.learners.sac), jax.tree.leaves(after.learners.sac), strict=True)
     for expected, found in leaves:
@@ -163,16 +155,16 @@ def test_a_member_that_diverges_is_frozen_and_the_other_is_as_without_it(pair):
 def test_labels_are_samples_of_the_posterior():
     config = point_config()
     data, _ = to_device(point_dataset(), config.skills.horizon)
-    model = SkillModel(2, 2, 2, 16, 1, (32, 32), (32, 32))
+    model = SkillModel(2, 2, SIZES)
     params = model.init(jax.random.key(0))
     encoder = jax.tree.map(jnp.zeros_like, params["encoder"])
     encoder["params"]["Dense_0"]["bias"] = jnp.array([1.0, -2.0, -5.0, -5.0])  # mean (1, -2), deviation exp(-5)
     artifacts = {"skills": jax.tree.map(lambda x: x[None], params | {"encoder": encoder})}
     config = configs.replace(config, **{"skills.latent_box": 10.0})
-    population = Population(configs.population_hyper(config))
-    phase = LabelPhase(config, data, population, TrajectorySkills(model, "box"), chunk_size=1000)
+    phase = LabelPhase(config.skills.horizon, len(data.starts), TrajectorySkills(model, "box"), chunk_size=1000)
     assert phase.num_chunks > 1
-    labels = run(phase, phase_keys(np.zeros(1, np.uint32), 0), artifacts)["labels"]
+    keys = phase_keys(np.zeros(1, np.uint32), 0)
+    labels = run_phase(bound(phase, config, data), keys, artifacts)[2]["labels"]
     assert labels.shape == (1, data.starts.shape[0], 2)
     np.testing.assert_allclose(labels[0], np.broadcast_to([0.1, -0.2], labels.shape[1:]), atol=0.005)
 
@@ -182,30 +174,30 @@ def rows(size=64):
     observation = jax.random.normal(keys[0], (size, 2))
     mask = (observation[:, 0] < 1).astype(jnp.float32)
     observation = observation.at[:, 0].add(1 - mask)  # a gap, so that the border can be learned
-    return MacroRows(observation, -2 * mask, mask, observation), jax.random.normal(keys[1], (size, 1))
+    return Transition(observation, jax.random.normal(keys[1], (size, 1)), -2 * mask, mask, observation)
 
 
 def test_offline_rewards_by_hand():
-    batch, action = rows()
-    reward, mask = DataReward().label({}, batch, action, 0.9)
+    batch = rows()
+    reward, mask = DataReward().label({}, batch, 0.9)
     np.testing.assert_array_equal(reward, batch.reward)
     np.testing.assert_array_equal(mask, batch.mask)
-    minimum = MinimumReward(RewardModel(3, (8,)), horizon=3)
-    reward, _ = minimum.label(minimum.init(jax.random.key(0)), batch, action, 0.5)
+    minimum = MinimumReward(RewardModel(3, (8,)), horizon=3, lowest=-1.0)
+    reward, _ = minimum.label(minimum.init(jax.random.key(0)), batch, 0.5)
     np.testing.assert_allclose(reward, -1.75)
 
 
 def test_the_reward_model_learns_rewards_and_ends_and_waits_for_its_start():
-    batch, action = rows()
+    batch = rows()
     labeller = PredictedReward(RewardModel(3, (32,)))
     state = labeller.init(jax.random.key(1))
-    waiting = labeller.learn(state, batch, action, 1e-2, jnp.array(False))
+    waiting = labeller.learn(state, batch, 1e-2, jnp.array(False))
     for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(waiting), strict=True):
         np.testing.assert_array_equal(a, b)
-    learn = jax.jit(lambda s: labeller.learn(s, batch, action, 3e-3, jnp.array(True)))
+    learn = jax.jit(lambda s: labeller.learn(s, batch, 3e-3, jnp.array(True)))
     for _ in range(1000):
         state = learn(state)
-    reward, mask = labeller.label(state, batch, action, 0.9)
+    reward, mask = labeller.label(state, batch, 0.9)
     assert float(jnp.mean((reward - batch.reward) ** 2)) < 0.05
     assert float(jnp.mean(jnp.abs(mask - batch.mask))) < 0.1
 
@@ -224,7 +216,7 @@ class CountingReward(DataReward):
     def init(self, key):
         return {"steps": jnp.zeros((), jnp.int32), "rows": jnp.zeros((), jnp.int32)}
 
-    def learn(self, state, rows, action, learning_rate, active):
+    def learn(self, state, rows, learning_rate, active):
         return {"steps": state["steps"] + active, "rows": state["rows"] + active * len(rows.reward)}
 
 
@@ -242,12 +234,14 @@ def test_the_bonus_learns_every_macro_step_once_and_the_labeller_as_often_as_the
     settings = {"labels.start_env_steps": 0, "high_level.utd": 3, "high_level.offline_fraction": 0.25}
     config = point_config(**settings)
     phase, artifacts, keys = online_phase(plane, config, CountingReward(), SummingBonus())
-    state, _ = phase.chunk(phase.init(keys, artifacts))
-    learners, replay = state.learners, state.replay
+    state, _ = phase.chunk(*phase.init(keys, artifacts))
+    learners, replay = state.learners, state.acting.replay
     played = int(replay.size[0])
     assert played > config.high_level.num_envs
-    assert int(learners.rnd["steps"][0]) == played
-    np.testing.assert_allclose(learners.rnd["sum"][0], replay.data.observation[0, :played].sum(0), rtol=1e-4, atol=1e-4)
+    assert int(learners.bonus["steps"][0]) == played
+    np.testing.assert_allclose(
+        learners.bonus["sum"][0], replay.data.observation[0, :played].sum(0), rtol=1e-4, atol=1e-4
+    )
     assert int(learners.labeller["steps"][0]) == 3 * played == int(state.update[0])
     assert int(learners.labeller["rows"][0]) == 3 * played * round(0.75 * config.high_level.batch_size)
 

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qdos_brax.high_level.sac import SAC, Batch, SACHyper
+from qdos_brax.config import HighLevelConfig
+from qdos_brax.data.transitions import Transition
+from qdos_brax.high_level.sac import SAC, SACHyper
 from qdos_brax.nn.networks import gaussian_log_prob
 from qdos_brax.nn.optim import ADAM, adam_step
 
@@ -16,7 +18,7 @@ HYPER = SACHyper(learning_rate=3e-3, discount=0.9, target_rate=0.05, target_entr
 
 def make_batch(key, size=16):
     keys = jax.random.split(key, 5)
-    return Batch(
+    return Transition(
         jax.random.normal(keys[0], (size, 3)),
         jnp.tanh(jax.random.normal(keys[1], (size, 2))),
         jax.random.normal(keys[2], (size,)),
@@ -27,7 +29,7 @@ def make_batch(key, size=16):
 
 @pytest.fixture(scope="module")
 def sac():
-    return SAC(3, 2, (8, 8), ensemble=4, target_subset=2)
+    return SAC(3, 2, HighLevelConfig(hidden=(8, 8), ensemble=4, target_subset=2))
 
 
 def test_critic_loss_sums_over_critics_and_means_over_the_batch(sac):
@@ -98,7 +100,7 @@ def test_adam_step_is_the_published_first_step():
 
 def test_a_value_scale_is_the_same_learner_in_other_units(sac):
     """Rewards times 20 at scale 20: the networks' targets, and so Adam's steps, are those of rewards at scale 1."""
-    scaled = SAC(3, 2, (8, 8), ensemble=4, target_subset=2, value_scale=20.0)
+    scaled = SAC(3, 2, HighLevelConfig(hidden=(8, 8), ensemble=4, target_subset=2, value_scale=20.0))
     state, batch, key = sac.init(jax.random.key(0), 0.1), make_batch(jax.random.key(1)), jax.random.key(2)
     plain_values = sac.values(state.critic, batch.observation, batch.action)
     scaled_values = scaled.values(state.critic, batch.observation, batch.action)
@@ -114,7 +116,7 @@ def test_with_a_value_scale_critics_reach_large_values_sooner():
     """Every episode ends at once with -300, so Q is -300 everywhere."""
 
     def values_after(scale, steps=150):
-        sac = SAC(3, 2, (32, 32), ensemble=2, target_subset=1, value_scale=scale)
+        sac = SAC(3, 2, HighLevelConfig(hidden=(32, 32), ensemble=2, target_subset=1, value_scale=scale))
         batch = make_batch(jax.random.key(1))
         batch = batch._replace(reward=jnp.full(16, -300.0), mask=jnp.zeros(16))
 
@@ -131,13 +133,13 @@ def test_with_a_value_scale_critics_reach_large_values_sooner():
 
 def test_sac_reaches_the_known_optimum_of_a_point_task():
     """x' = x + 0.5 u, reward -x'^2 on x in [-1, 1]: the optimum is u = -2 x clipped, the return near 0."""
-    sac = SAC(1, 1, (32, 32), ensemble=2, target_subset=1)
+    sac = SAC(1, 1, HighLevelConfig(hidden=(32, 32), ensemble=2, target_subset=1))
     hyper = HYPER.replace(discount=0.5, target_entropy=-2.0)
     keys = jax.random.split(jax.random.key(0), 4)
     x = jax.random.uniform(keys[0], (2048, 1), minval=-1.0)
     u = jax.random.uniform(keys[1], (2048, 1), minval=-1.0)
     after = jnp.clip(x + 0.5 * u, -1, 1)
-    rows = Batch(x, u, -10 * after[:, 0] ** 2, jnp.ones(2048), after)
+    rows = Transition(x, u, -10 * after[:, 0] ** 2, jnp.ones(2048), after)
 
     @jax.jit
     def train(state, key):

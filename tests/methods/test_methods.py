@@ -19,18 +19,33 @@ from qdos_brax.analysis.finished import evaluate_run
 from qdos_brax.commands.cli import train_main
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.methods import settings as recipe_settings
+from qdos_brax.data.device import to_device
+from qdos_brax.data.transitions import Transition
 from qdos_brax.errors import UserError
+from qdos_brax.high_level.acting import Acting
+from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.jump_start import JumpStart
+from qdos_brax.high_level.learning import Sources
+from qdos_brax.high_level.replay import insert
 from qdos_brax.high_level.sac import SAC
-from qdos_brax.methods.build import build_phases
+from qdos_brax.methods.build import build_context, build_phases
 from qdos_brax.nn.networks import gaussian_log_prob
-from qdos_brax.population.members import Population
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
 from qdos_brax.skills.latent_map import Prior, latent_map
 from qdos_brax.skills.low_level import DirectionSkills, PrimitiveActions, TransitionSkills
 from qdos_brax.skills.vae import Segments
-from tests.point import GOAL, STEP, TOLERANCE, PointEnv, point_config, point_dataset
+from tests.point import (
+    GOAL,
+    STEP,
+    TOLERANCE,
+    PointEnv,
+    bound,
+    first_member,
+    point_config,
+    point_dataset,
+    run_phase,
+)
 
 PHASES = {
     "qdos": ["values", "skills", "label", "online"],
@@ -54,7 +69,8 @@ def config_of(method: str, **values: Any) -> configs.Config:
 
 
 def phases_of(config: configs.Config, dataset: Any) -> list[Any]:
-    return build_phases(config, PointEnv(), dataset, Population(configs.population_hyper(config)))
+    context = build_context(config, PointEnv(), dataset)
+    return [bound(phase, config, context.data) for phase in build_phases(context)]
 
 
 def test_every_method_of_the_issue_is_there() -> None:
@@ -124,10 +140,8 @@ def test_rlpd_reaches_the_optimum_of_the_plane() -> None:
     )
     artifacts: dict[str, Any] = {}
     for phase in phases_of(config, point_dataset()):
-        state = phase.init(jax.random.split(jax.random.key(0), 1), artifacts)
-        for _ in range(phase.num_chunks):
-            state, metrics = phase.chunk(state)
-        artifacts = phase.finish(state, artifacts)
+        _, history, artifacts = run_phase(phase, jax.random.split(jax.random.key(0), 1), artifacts)
+        metrics = history[-1]
     starts = 0.1 * np.random.default_rng(0).normal(size=(1000, 2))
     best = np.mean([fewest_steps(start) for start in starts])
     assert 8 < best < 10
@@ -152,14 +166,16 @@ def test_the_guides_steps_are_geometric() -> None:
 def test_the_guide_acts_first_and_only_so_long() -> None:
     """What is stored is the guide's action for the drawn number of steps, and the actor's after."""
     config = config_of("diffusion-jsrl", **{"high_level.warmup_env_steps": 0})
-    phase = phases_of(config, point_dataset(20))[-1]
-    phase._guide.sample = lambda params, key, observation: jnp.full((observation.shape[0], 2), 0.123)
-    state = phase.init(jax.random.split(jax.random.key(0), 1), {"guide": {"x": jnp.zeros(1)}})
-    state = jax.tree.map(lambda x: x[0], state).replace(guided=jnp.array([3, 0]))
-    hyper = {key: value[0] for key, value in phase._hyper.items()}
-    act = jax.jit(phase._act)
+    guide = JumpStart(lambda params, key, observation: jnp.full((observation.shape[0], 2), 0.123), 0.9, 0.99)
+    _, normaliser = to_device(point_dataset(20), 1)
+    acting = Acting(config, PointEnv(), normaliser, 10, guide)
+    sac, hyper = SAC(2, 2, config.high_level), first_member(configs.population_hyper(config))
+    agent = Agent(normaliser, PrimitiveActions(2), sac, 1.0, {}, sac.init(jax.random.key(1), 1.0).actor)
+    row = Transition(jnp.zeros(2), jnp.zeros(2), jnp.zeros(()), jnp.zeros(()), jnp.zeros(2))
+    state = acting.start(jax.random.key(0), row).replace(guided=jnp.array([3, 0]))
+    act = jax.jit(lambda state, key: acting.step(state, key, agent, {}, hyper)[0])
     for n in range(5):
-        state, _, _ = act(state, jax.random.key(n), {"skills": {}, "guide": {}}, hyper)
+        state = act(state, jax.random.key(n))
     actions = np.asarray(state.replay.data.action[:10]).reshape(5, 2, 2)
     guided = (np.abs(actions - 0.123) < 1e-6).all(axis=-1)
     np.testing.assert_array_equal(guided, [[True, False]] * 3 + [[False, False]] * 2)
@@ -174,11 +190,11 @@ def test_the_bonus_is_on_the_rows_it_is_asked_for(rows: str) -> None:
     data = point_dataset(20)
     phase = phases_of(config, data)[-1]
     labels = {"labels": jnp.zeros((1, data.size, 2)), "skills": {}}
-    state = jax.tree.map(lambda x: x[0], phase.init(jax.random.split(jax.random.key(0), 1), labels))
-    frozen = {"skills": {}, "labels": labels["labels"][0]}
-    hyper = {key: value[0] for key, value in phase._hyper.items()}
-    state, _, _ = jax.jit(phase._act)(state, jax.random.key(1), frozen, hyper)
-    batch = phase._sample(state.learners, state.replay, jax.random.key(2), frozen=frozen, hyper=hyper, data=phase._data)
+    state, constants = first_member(phase.init(jax.random.split(jax.random.key(0), 1), labels))
+    row = Transition(jnp.ones((1, 2)), jnp.ones((1, 2)), -jnp.ones(1), jnp.ones(1), jnp.ones((1, 2)))
+    replay = insert(state.acting.replay, row)
+    sources = Sources(replay, phase.data, {}, constants["labels"], first_member(phase.hyper))
+    batch = phase.learning.sample(state.learners, jax.random.key(2), sources)
     offline, online = np.split(np.asarray(batch.reward), 2)
     assert (online > -1).all()  # each earned -1 and a bonus
     assert np.isin(offline, [-1.0, 0.0]).all() == (rows == "online")
@@ -186,7 +202,7 @@ def test_the_bonus_is_on_the_rows_it_is_asked_for(rows: str) -> None:
 
 def test_divergence_from_the_skill_prior_by_hand() -> None:
     """An untrained actor of zeros is N(0, 1) before the squashing: KL 0 from that prior, d / 2 from N(1, 1)."""
-    sac = SAC(2, 3, (8,), 2, 1)
+    sac = SAC(2, 3, configs.HighLevelConfig(hidden=(8,), ensemble=2, target_subset=1))
     state = sac.init(jax.random.key(0), 1.0)
     actor = jax.tree.map(jnp.zeros_like, state.actor)
     mapping, observation = latent_map("arctanh", 1.0), jnp.zeros((20_000, 2))

@@ -5,11 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qdos_brax.config import PolicyConfig
 from qdos_brax.offline.bc import BC
 from tests.offline.gridworld import device_data
 from tests.offline.training import train, train_members
 
 STATES = 5
+
+SIZES = PolicyConfig(hidden=(32,), batch_size=256)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +27,7 @@ def logged():
 
 def test_a_gaussian_policy_has_the_empirical_means_and_spread(logged):
     state, action, data = logged
-    learner = BC(STATES, 2, (32,), batch_size=256)
+    learner = BC(STATES, 2, SIZES)
     # Two members of a population: the second does not learn, and must stay as it was.
     both = train_members(learner, data, {"policy.learning_rate": np.array([3e-3, 0.0])}, 1500)
     mean, log_std = jax.jit(jax.vmap(learner.policy.apply, in_axes=(0, None)))(both.actor, jnp.eye(STATES))
@@ -43,7 +46,7 @@ def test_a_gaussian_policy_has_the_empirical_means_and_spread(logged):
 @pytest.mark.slow
 def test_a_deterministic_policy_is_least_squares(logged):
     state, action, data = logged
-    learner = BC(STATES, 2, (32,), batch_size=256, learned_std=False)
+    learner = BC(STATES, 2, SIZES, learned_std=False)
     trained, _ = train(learner, data, {"policy.learning_rate": 3e-3}, 1500)
     acted = learner.act(learner.params(trained), jnp.eye(STATES))
     empirical = np.stack([action[state == s].mean(axis=0) for s in range(STATES)])

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qdos_brax.config import GuideConfig
 from qdos_brax.offline.diffusion import DiffusionBC, add_noise, variance_preserving_schedule
 from tests.offline.gridworld import device_data
 from tests.offline.training import train
@@ -69,7 +70,7 @@ def sampled(learner, state):
 @pytest.mark.slow
 def test_both_modes_keep_their_shares_which_no_gaussian_can():
     observation, action = two_modes()
-    learner = DiffusionBC(1, 2, hidden=32, steps=10, batch_size=256, blocks=2, dropout=0.0)
+    learner = DiffusionBC(1, 2, GuideConfig(hidden=32, steps=10, batch_size=256), blocks=2, dropout=0.0)
     hyper = {"guide.learning_rate": 3e-3, "guide.average_rate": 0.01}
     state, _ = train(learner, device_data(observation, action), hyper, 2500)
     rng = np.random.default_rng(1)

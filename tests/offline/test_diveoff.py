@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qdos_brax.config import DiveOffConfig
 from qdos_brax.offline.diveoff import DiveOff
 from qdos_brax.skills.values import ValueBatch
 from tests.offline.gridworld import device_data
@@ -20,7 +21,7 @@ def constant(width_in, biases):
 
 
 def test_the_losses_by_hand():
-    learner = DiveOff(1, 1, latent_dim=1, hidden=(), batch_size=2)
+    learner = DiveOff(1, 1, 1, DiveOffConfig(hidden=(), batch_size=2))
     batch = ValueBatch(
         observation=jnp.array([[1.0], [0.0]]),
         action=jnp.array([[0.5], [0.0]]),
@@ -71,7 +72,7 @@ def test_it_finds_both_solutions_and_no_failure():
     actions = np.concatenate([SOLUTIONS, FAILURES])[kind] + 0.1 * rng.normal(size=(2000, 2))
     states = rng.uniform(-1, 1, (2000, 1))
     data = device_data(states, actions, rewards=np.where(kind < 2, 0.0, -5.0), masks=np.zeros(2000))
-    learner = DiveOff(1, 2, latent_dim=1, hidden=(32, 32), batch_size=128, autoencoder_updates=300)
+    learner = DiveOff(1, 2, 1, DiveOffConfig(hidden=(32, 32), batch_size=128, autoencoder_updates=300))
     hyper = {
         "diveoff.learning_rate": 3e-3,
         "diveoff.autoencoder_rate": 0.1,

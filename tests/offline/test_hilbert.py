@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qdos_brax.config import HilbertConfig
 from qdos_brax.offline.hilbert import GoalBatch, Hilbert, HilbertHyper, goal_rows
 from tests.offline.gridworld import MOVES, Gridworld, device_data
 from tests.offline.training import train
@@ -61,7 +62,7 @@ def test_norms_are_shortest_paths_and_skills_follow_them():
     after = np.clip(np.arange(11)[:, None] + np.array([-1, 1]), 0, 10)
     observations = (places - places.mean(axis=0)) / places.std(axis=0)
     data = walks(after, observations, np.array([-1.0, 1.0]), episodes=100, length=20)
-    learner = Hilbert(2, 1, latent_dim=2, hidden=(32, 32), batch_size=128)
+    learner = Hilbert(2, 1, 2, HilbertConfig(hidden=(32, 32), batch_size=128))
     state, _ = train(learner, data, HYPER, 2000)
     distance, action = looks(learner, learner.params(state), jnp.asarray(observations))
 
@@ -85,7 +86,7 @@ def test_norms_rank_the_ways_around_walls_of_a_grid():
     grid = Gridworld([".....", ".###.", "...#.", ".#.#.", ".#..G"])
     observations = grid.cells - grid.cells.mean(axis=0)
     data = walks(grid.after, observations, MOVES.astype(float), episodes=300, length=40)
-    learner = Hilbert(2, 2, latent_dim=8, hidden=(64, 64), batch_size=128)
+    learner = Hilbert(2, 2, 8, HilbertConfig(hidden=(64, 64), batch_size=128))
     state, _ = train(learner, data, HYPER, 5000)
     distance, action = looks(learner, learner.params(state), jnp.asarray(observations))
     steps, apart = grid.distances(), ~np.eye(grid.size, dtype=bool)
@@ -115,7 +116,7 @@ def test_goals_lie_ahead_in_the_episode_or_anywhere():
 
 def test_the_losses_by_hand():
     """phi is the identity of the line: a network without hidden layers, so that every number can be worked out."""
-    learner = Hilbert(1, 1, latent_dim=1, hidden=(), batch_size=1)
+    learner = Hilbert(1, 1, 1, HilbertConfig(hidden=(), batch_size=1))
     identity = {"params": {"Dense_0": {"kernel": jnp.ones((2, 1, 1)), "bias": jnp.zeros((2, 1))}}}
     hyper = HilbertHyper(1e-3, 0.9, 0.9, 0.5, 0.005, 10.0)
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qdos_brax.config import PolicyConfig
 from qdos_brax.offline.iql_policy import IQLPolicy, regression_weight
 from qdos_brax.skills.values import IQL
 from tests.offline.gridworld import MOVES, Gridworld
@@ -17,7 +18,7 @@ GRID = ["....", ".##.", "..#.", "..#G"]
 @pytest.fixture(scope="module")
 def trained():
     grid = Gridworld(GRID)
-    learner = IQLPolicy(grid.size, 2, (64,), IQL(grid.size, 2, (64,)), batch_size=128)
+    learner = IQLPolicy(grid.size, 2, PolicyConfig(hidden=(64,), batch_size=128), IQL(grid.size, 2, (64,)))
     hyper = {
         "values.learning_rate": 2e-3,
         "values.expectile": EXPECTILE,

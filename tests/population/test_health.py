@@ -23,7 +23,6 @@ from qdos_brax.labels.offline_reward import DataReward
 from qdos_brax.offline.bc import BC
 from qdos_brax.offline.offline_phase import OfflinePhase
 from qdos_brax.population import health
-from qdos_brax.population.members import Population
 from qdos_brax.report.write import write_report
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
@@ -35,32 +34,33 @@ from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.vae import SkillModel
 from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
-from tests.point import PointEnv, point_config, point_dataset
+from tests.point import PointEnv, bound, point_config, point_dataset
 
 SMALL = {"values.updates": 20, "skills.updates": 20, "skills.mi_every": 10, "values.estimator": "iql"}
 SEEDS = (0, 1, 2)
 RATES = ("values.learning_rate", "skills.learning_rate", "policy.learning_rate", "high_level.learning_rate")
+SIZES = configs.SkillsConfig(latent_dim=2, encoder_hidden=8, encoder_layers=1, decoder_hidden=(16,), prior_hidden=(16,))
 ABSURD = 1e30  # no user can ask for it; it stands for whatever makes a member diverge
 
 
 @pytest.fixture(scope="module")
 def phases() -> dict[str, Any]:
-    """Every kind of phase that learns, for three members; ``_hyper`` is to be set."""
+    """Every kind of phase that learns, for three members; ``hyper`` is to be set."""
     config = configs.replace(point_config(**SMALL), seed=SEEDS)
     data, normaliser = to_device(point_dataset(episodes=40), config.skills.horizon)
-    population = Population(hyper_of(config))
-    model = SkillModel(2, 2, 2, 8, 1, (16,), (16,))
+    model = SkillModel(2, 2, SIZES)
     information = PhysicsRollout(PointEnv(), model, normaliser, config.skills.horizon, data)
-    source = TrajectorySkills(model, "box")
-    return {
-        "values": ValuePhase(config, data, population, IQL(2, 2, (16,)), updates_per_chunk=10),
-        "skills": SkillPhase(config, data, population, model, LoggedWeights(), information, blocks_per_chunk=1),
-        "policy": OfflinePhase("policy", BC(2, 2, (16,), 16), data, normaliser, population, 20, None, 10),
-        "label": LabelPhase(config, data, population, source),
-        "online": OnlinePhase(
-            config, PointEnv(), data, normaliser, population, source, DataReward(), NoBonus(), steps_per_chunk=100
-        ),
+    low_level = TrajectorySkills(model, "box")
+    policy = BC(2, 2, configs.PolicyConfig(hidden=(16,), batch_size=16))
+    online = OnlinePhase(config, PointEnv(), normaliser, low_level, DataReward(), NoBonus(), steps_per_chunk=100)
+    phases = {
+        "values": ValuePhase(config, IQL(2, 2, (16,)), updates_per_chunk=10),
+        "skills": SkillPhase(config, model, LoggedWeights(), information, blocks_per_chunk=1),
+        "policy": OfflinePhase("policy", policy, normaliser, 20, None, 10),
+        "label": LabelPhase(config.skills.horizon, len(data.starts), low_level),
+        "online": online,
     }
+    return {name: bound(phase, config, data) for name, phase in phases.items()}
 
 
 def hyper_of(config: Config) -> dict[str, jax.Array]:
@@ -76,7 +76,7 @@ def run(phases: dict[str, Any], path: Path, diverging: str | None = None) -> Pat
     folder = RunFolder.create(path)
     folder.config.write_text(configs.to_yaml(config), encoding="utf-8")
     for phase in phases.values():
-        phase._hyper = hyper
+        phase.hyper = hyper
     header = {"env": "the plane", "method": "qdos", "preset": "smoke", "physics": "toy"}
     run_phases(list(phases.values()), folder, configs.members(config), config="0" * 16, header=header)
     return path
@@ -134,11 +134,9 @@ def breaking() -> tuple[SkillPhase, dict[str, jax.Array]]:
     """(a skill phase of three members whose rollouts break here and there, what it starts from)."""
     config = configs.replace(point_config(**SMALL, **{"skills.alpha": 1.0}), seed=SEEDS)
     data, normaliser = to_device(point_dataset(episodes=40), config.skills.horizon)
-    model = SkillModel(2, 2, 2, 8, 1, (16,), (16,))
+    model = SkillModel(2, 2, SIZES)
     information = PhysicsRollout(BreakingEnv(), model, normaliser, config.skills.horizon, data)
-    phase = SkillPhase(
-        config, data, Population(hyper_of(config)), model, LoggedWeights(), information, blocks_per_chunk=1
-    )
+    phase = bound(SkillPhase(config, model, LoggedWeights(), information, blocks_per_chunk=1), config, data)
     return phase, {"advantage": jnp.zeros((3, data.starts.shape[0]))}
 
 
@@ -146,11 +144,11 @@ def test_what_breaks_in_the_skill_phase_stays_where_it_arose(breaking: tuple[Ski
     phase, artifacts = breaking
     found = []
     for rate in (1e-3, ABSURD):
-        phase._hyper["skills.learning_rate"] = jnp.array([1e-3, rate, 1e-3])
+        phase.hyper["skills.learning_rate"] = jnp.array([1e-3, rate, 1e-3])
         keys = jax.vmap(jax.random.key)(np.asarray(SEEDS, np.uint32))
-        start = phase.init(keys, artifacts)
+        start, constants = phase.init(keys, artifacts)
         initial = jax.tree.map(np.asarray, start.params)
-        state, metrics = phase.chunk(start)
+        state, metrics = phase.chunk(start, constants)
         found.append((jax.tree.map(np.asarray, state.params), metrics))
     (sane, metrics), (params, after) = found
     # Simulations that break are counted, and cost no member its health.
@@ -162,7 +160,7 @@ def test_what_breaks_in_the_skill_phase_stays_where_it_arose(breaking: tuple[Ski
         np.testing.assert_array_equal(a[[0, 2]], b[[0, 2]])
         np.testing.assert_array_equal(a[1], c[1])
     handed_on = phase.finish(state, artifacts)
-    np.testing.assert_array_equal(phase.init(keys, handed_on).healthy, [True, False, True])
+    np.testing.assert_array_equal(phase.init(keys, handed_on)[0].healthy, [True, False, True])
 
 
 @pytest.mark.parametrize("engine", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])

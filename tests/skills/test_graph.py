@@ -16,7 +16,7 @@ from qdos_brax.errors import UserError
 from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.slow_features import slow_features
 from qdos_brax.skills.state_graph import costs_to_go, step_costs
-from tests.point import GOAL, TOLERANCE, point_config, point_dataset
+from tests.point import GOAL, TOLERANCE, bound, point_config, point_dataset
 
 
 def test_costs_of_steps_by_hand():
@@ -119,8 +119,8 @@ def test_slow_features_find_the_slow_direction_and_its_scale():
 def run(config: configs.Config, dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Values[N] and advantages[S]."""
     data, _ = to_device(dataset, config.skills.horizon)
-    phase = GraphPhase(config.values, config.skills, data, dataset.ends, members=2)
-    state, metrics = phase.chunk(phase.init(jax.random.split(jax.random.key(0), 2), {}))
+    phase = bound(GraphPhase(config.values, config.skills, dataset.ends), configs.replace(config, seed=(0, 1)), data)
+    state, metrics = phase.chunk(*phase.init(jax.random.split(jax.random.key(0), 2), {}))
     assert phase.num_chunks == 1 and metrics["update"].shape == (2,)
     advantage = np.asarray(phase.finish(state, {})["advantage"])
     np.testing.assert_array_equal(advantage[0], advantage[1])

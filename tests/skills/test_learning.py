@@ -1,5 +1,6 @@
 """The offline learners reach what is known: a chain's values, and skills that can be told apart."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -10,14 +11,13 @@ import pytest
 from qdos_brax import config as configs
 from qdos_brax.data.device import to_device
 from qdos_brax.nn.networks import gaussian_sample
-from qdos_brax.population.members import Population
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper
-from tests.point import GOAL, PointEnv, point_config, point_dataset
+from tests.point import GOAL, PointEnv, bound, first_member, point_config, point_dataset, run_phase
 
 
 def test_iql_finds_the_values_of_a_chain():
@@ -56,28 +56,25 @@ def test_iql_finds_the_values_of_a_chain():
 
 
 def make_model(config, env):
-    skills = config.skills
-    return SkillModel(env.observation_size, env.action_size, skills.latent_dim, 32, 1, (32, 32), (32, 32))
+    sizes = {"encoder_hidden": 32, "encoder_layers": 1, "decoder_hidden": (32, 32), "prior_hidden": (32, 32)}
+    return SkillModel(env.observation_size, env.action_size, replace(config.skills, **sizes))
 
 
 def train_skills(config, weights=None, information=True, artifacts=None, chunks=None, spread=np.pi):
     env, dataset = PointEnv(), point_dataset(spread=spread)
     data, normaliser = to_device(dataset, config.skills.horizon)
-    population = Population(configs.population_hyper(config))
     model = make_model(config, env)
     source = None
     if information:
         source = PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
         if config.skills.mi_rollout == "logged":
             source = LoggedStates(config.skills.horizon)
-    phase = SkillPhase(config, data, population, model, weights or UniformWeights(), source)
-    members = population.members
-    state = phase.init(jax.random.split(jax.random.key(0), members), artifacts or {})
+    phase = bound(SkillPhase(config, model, weights or UniformWeights(), source), config, data)
+    state, constants = phase.init(jax.random.split(jax.random.key(0), len(configs.members(config))), artifacts or {})
     metrics = {}
     for _ in range(chunks or phase.num_chunks):
-        state, metrics = phase.chunk(state)
-    params = jax.tree.map(lambda x: x[0], state.params)
-    return env, model, normaliser, params, metrics, phase
+        state, metrics = phase.chunk(state, constants)
+    return env, model, normaliser, first_member(state.params), metrics, phase
 
 
 def decodability(env, model, normaliser, params, config):
@@ -125,12 +122,9 @@ def test_skills_reconstruct_what_the_data_does():
 def value_phase(config):
     dataset = point_dataset()
     data, _ = to_device(dataset, config.skills.horizon)
-    population = Population(configs.population_hyper(config))
-    phase = ValuePhase(config, data, population, IQL(2, 2, (64, 64)), updates_per_chunk=500)
-    state = phase.init(jax.random.split(jax.random.key(0), 1), {})
-    for _ in range(phase.num_chunks):
-        state, _ = phase.chunk(state)
-    return dataset, data, phase, phase.finish(state, {})
+    phase = bound(ValuePhase(config, IQL(2, 2, (64, 64)), updates_per_chunk=500), config, data)
+    _, _, artifacts = run_phase(phase, jax.random.split(jax.random.key(0), 1), {})
+    return dataset, data, phase, artifacts
 
 
 @pytest.fixture(scope="module")
@@ -179,21 +173,20 @@ def test_latent_weights_learn_along(values):
 
 def test_chunks_are_not_traced_again_and_members_differ_by_seed_and_value():
     config = configs.replace(point_config(), **{"seed": (0, 1), "skills.alpha": (0.1, 0.3)})
-    population = Population(configs.population_hyper(config))
     env = PointEnv()
     data, normaliser = to_device(point_dataset(), config.skills.horizon)
     model = make_model(config, env)
     source = PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
-    phase = SkillPhase(config, data, population, model, UniformWeights(), source, blocks_per_chunk=2)
+    phase = bound(SkillPhase(config, model, UniformWeights(), source, blocks_per_chunk=2), config, data)
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
-    state = phase.init(jax.vmap(jax.random.key)(seeds), {})
+    state, constants = phase.init(jax.vmap(jax.random.key)(seeds), {})
     leaf = partial(lambda s: np.asarray(jax.tree.leaves(s.params["decoder"])[1]))
     first = leaf(state)
     np.testing.assert_array_equal(first[0], first[1])  # seed 0 with either alpha starts the same
     assert not np.array_equal(first[0], first[2])
-    state, _ = phase.chunk(state)
+    state, _ = phase.chunk(state, constants)
     traced = phase._chunk._cache_size()
-    state, _ = phase.chunk(state)
+    state, _ = phase.chunk(state, constants)
     assert phase._chunk._cache_size() == traced == 1
     last = leaf(state)
     assert not np.array_equal(last[0], last[1]) and not np.array_equal(last[0], last[2])

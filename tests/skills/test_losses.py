@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qdos_brax import config as configs
 from qdos_brax.nn.networks import gaussian_kl, gaussian_sample
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.values import IQL, ValueBatch, expectile_loss
@@ -87,7 +88,11 @@ def test_no_gradient_passes_through_the_weights():
 
 @pytest.fixture(scope="module")
 def model():
-    return SkillModel(3, 2, 2, encoder_hidden=8, encoder_layers=1, decoder_hidden=(8,), prior_hidden=(8,))
+    return SkillModel(
+        3,
+        2,
+        configs.SkillsConfig(latent_dim=2, encoder_hidden=8, encoder_layers=1, decoder_hidden=(8,), prior_hidden=(8,)),
+    )
 
 
 @pytest.fixture(scope="module")

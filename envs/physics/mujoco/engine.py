@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 
 from envs.physics.base import PipelineState
+from envs.physics.host_function import HostFunction
 from envs.physics.mujoco.rig import Rig
 from envs.physics.mujoco.stepper import BatchStepper, with_changes
 
@@ -54,6 +55,9 @@ class MujocoEngine:
         self.action_size = model.nu if self._rig.action_size is None else self._rig.action_size
         self.extra_size = self._rig.extra_size
         self._stepper = BatchStepper(model, self._rig, frame_skip, threads)
+        identity = self._stepper.identity() + self._rig.identity()
+        self._step = HostFunction(self._step_batch, b"step" + identity)
+        self._start = HostFunction(self._start_batch, b"start" + identity)
 
     def init(self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None) -> PipelineState:
         """Return the state at (qpos[nq], qvel[nv], extra[e]), as after ``mj_resetData`` and ``set_state``.
@@ -64,10 +68,7 @@ class MujocoEngine:
         extra = jnp.zeros(self.extra_size, jnp.int32) if extra is None else jnp.asarray(extra, jnp.int32)
         memory, sensed = jnp.zeros(2 * self._rig.memory_size, jnp.uint32), jnp.zeros(self._rig.sensed_size)
         if self._rig.memory_size or self._rig.sensed_size:
-            shapes = (_shape_of(memory), _shape_of(sensed))
-            memory, sensed = jax.pure_callback(
-                self._start_batch, shapes, qpos, qvel, extra, vmap_method="broadcast_all"
-            )
+            memory, sensed = self._start((_shape_of(memory), _shape_of(sensed)), qpos, qvel, extra)
         bits = jnp.concatenate([jnp.zeros(2 * self._stepper.nstate, jnp.uint32), memory])
         return PipelineState(qpos, qvel, sensed, extra, MujocoCarry(bits=bits, fresh=jnp.ones((), bool)))
 
@@ -77,8 +78,7 @@ class MujocoEngine:
         A number of qpos or qvel that is no longer the rounding of the exact one was changed by hand, and counts.
         """
         discrete = (state.extra,) if self.extra_size else ()  # an empty array would cost every call microseconds
-        qpos, qvel, sensed, bits, *extra = jax.pure_callback(
-            self._step_batch,
+        qpos, qvel, sensed, bits, *extra = self._step(
             tuple(map(_shape_of, (state.qpos, state.qvel, state.sensed, state.carry.bits, *discrete))),
             state.qpos,
             state.qvel,
@@ -86,7 +86,6 @@ class MujocoEngine:
             state.carry.fresh,
             jnp.asarray(action, jnp.float32),
             *discrete,
-            vmap_method="broadcast_all",
         )
         carry = MujocoCarry(bits=bits, fresh=jnp.zeros_like(state.carry.fresh))
         return PipelineState(qpos, qvel, sensed, extra[0] if extra else state.extra, carry)

@@ -29,6 +29,13 @@ class Rig:
     fields: tuple[str, ...] = ()
     stage: mujoco.mjtStage = mujoco.mjtStage.mjSTAGE_NONE
 
+    def identity(self) -> bytes:
+        """Return all that decides what the rig computes: a compiled program in a cache finds its engine by it.
+
+        Subclasses with arguments of their own add them.
+        """
+        return f"{type(self).__module__}.{type(self).__qualname__}".encode()
+
     def start(self, batch: Batch, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (memory float64[n, m], sensed float32[n, k]) of a start, after a forward pass of ``batch``.
 

@@ -50,6 +50,12 @@ class BatchStepper:
         self._rest = _rest_row(model)
         self._idle: dict[int, list[Batch]] = defaultdict(list)
 
+    def identity(self) -> bytes:
+        """Return all that decides what a step computes, but for the rig's share."""
+        content = np.empty(mujoco.mj_sizeModel(self._model), np.uint8)
+        mujoco.mj_saveModel(self._model, None, content)
+        return content.tobytes() + repr((mujoco.__version__, self._frame_skip, self._threads)).encode()
+
     def start(self, qpos: np.ndarray, qvel: np.ndarray, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the rig's (memory float64[n, m], sensed float32[n, k]) at rest rows with (qpos, qvel, extra)."""
         with self._batch(len(qpos)) as batch:
