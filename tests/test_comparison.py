@@ -45,14 +45,16 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     data.write_bytes(b"the same for all")
     built: list[str] = []
 
-    def phases(config: Any, env: Any, dataset: Any, population: Any) -> list[toy.ToyPhase]:
+    def phases(context: Any) -> list[toy.ToyPhase]:
+        config = context.config
         built.append(config.method)
         kind = DyingPhase if config.out.endswith("killed/supe") and built.count("supe") == 1 else toy.ToyPhase
         return [kind(phase.name, phase.num_chunks) for phase in toy.phases()]
 
     monkeypatch.setattr(experiment, "_default_data", lambda config, env: data)
     monkeypatch.setattr(experiment.formats, "read", lambda path, env: None)
-    monkeypatch.setattr(experiment, "build_context", lambda config, env, dataset: SimpleNamespace(data=None))
+    context = lambda config, env, dataset: SimpleNamespace(config=config, data=None)  # noqa: E731
+    monkeypatch.setattr(experiment, "build_context", context)
     monkeypatch.setattr(experiment, "build_phases", phases)
     monkeypatch.setattr(experiment, "bind_phases", lambda *args: None)
     monkeypatch.setattr(

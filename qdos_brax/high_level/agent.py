@@ -13,20 +13,20 @@ from qdos_brax.skills.low_level import LowLevelPolicy
 
 
 class Policy(Protocol):
-    """Whatever plays episodes: a decision every H environment steps, and actions in between."""
+    """Define what plays episodes: a decision every H environment steps, and actions in between."""
 
     def choose(self, observation: jax.Array) -> jax.Array:
-        """The decision at observation[obs], as the environment gives it."""
+        """Return the decision at observation[obs], as the environment gives it."""
         ...
 
     def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The action[act] of a decision at an observation."""
+        """Return the action[act] of a decision at an observation."""
         ...
 
 
 @dataclass(frozen=True)
 class Agent:
-    """Both levels with their parameters.
+    """Play with both levels and their parameters.
 
     Attributes:
         normaliser: of observations.
@@ -45,10 +45,10 @@ class Agent:
     actor: Any
 
     def choose(self, observation: jax.Array) -> jax.Array:
-        """The latent z[..., width] for observation[..., obs]: the mode of the high level's policy."""
+        """Return the latent z[..., width] for observation[..., obs]: the mode of the high level's policy."""
         normal = self.normaliser(observation)
         return self.low_level.to_latent(self.skills, self.sac.mode(self.actor, normal), normal, self.box)
 
     def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The action[..., act] of latent z at an observation."""
+        """Return the action[..., act] of latent z at an observation."""
         return self.low_level.act(self.skills, self.normaliser(observation), latent)

@@ -14,7 +14,9 @@ from qdos_brax.high_level.macro_step import macro_step
 
 
 class Episodes(NamedTuple):
-    """One entry per episode: success[N] (0 or 1), undiscounted episode_return[N], length[N] in environment steps."""
+    """Hold one entry per episode: success[N] (0 or 1), undiscounted episode_return[N], length[N] in environment
+    steps.
+    """
 
     success: jax.Array
     episode_return: jax.Array
@@ -29,7 +31,7 @@ def evaluate(
     episodes: int,
     horizon: int,
 ) -> Episodes:
-    """Plays ``episodes`` episodes side by side until all are over.
+    """Play ``episodes`` episodes side by side until all are over.
 
     Args:
         env: the task.
@@ -62,7 +64,7 @@ def evaluate(
 
 
 def summary(episodes: Episodes) -> dict[str, np.ndarray]:
-    """Columns of metrics.csv, [members] each, of episodes[members, N]."""
+    """Return columns of metrics.csv, [members] each, of episodes[members, N]."""
     success = np.asarray(episodes.success)
     return {
         "eval/success": success.mean(axis=-1),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 
 class JumpStart:
-    """The guide and its schedule.
+    """Schedule a guide for the first steps of episodes.
 
     Args:
         sample: (parameters, key, normalised observation[..., obs]) -> action[..., act] of the guide.
@@ -29,7 +29,7 @@ class JumpStart:
         self._ratio, self._persistence = ratio, persistence
 
     def draw(self, key: jax.Array, episodes: int) -> jax.Array:
-        """int32[episodes], how many first steps of each the guide takes: 0, or geometric from 1 on."""
+        """Return int32[episodes], how many first steps of each the guide takes: 0, or geometric from 1 on."""
         guided_key, length_key = jax.random.split(key)
         guided = jax.random.bernoulli(guided_key, self._ratio, (episodes,))
         length = jax.random.geometric(length_key, 1 - self._persistence, (episodes,), jnp.int32)

@@ -11,7 +11,7 @@ from brax.envs.base import Env, State
 
 
 class MacroStep(NamedTuple):
-    """What a macro step brought; scalars but for the observation.
+    """Hold what a macro step brought; scalars but for the observation.
 
     Attributes:
         reward: sum of discounted environment rewards over the live steps.
@@ -35,7 +35,7 @@ class MacroStep(NamedTuple):
 def macro_step(
     env: Env, policy: Callable[[jax.Array], jax.Array], state: State, horizon: int, discount: jax.Array | float
 ) -> tuple[State, MacroStep]:
-    """Plays ``policy`` (observation -> action) for ``horizon`` steps of one environment, batched by ``jax.vmap``.
+    """Play ``policy`` (observation -> action) for ``horizon`` steps of one environment, batched by ``jax.vmap``.
 
     An episode that ends early idles to the end of the macro step: its state stays, and only live steps count. The
     environment is not reset. A state that is done already gives a macro step of no live steps and reward 0.
@@ -66,7 +66,7 @@ def macro_step(
 
 
 def reset_done(env: Env, state: State, broken: jax.Array, key: jax.Array) -> State:
-    """A fresh episode where the old one is over or the simulation broke; for one environment."""
+    """Return a fresh episode where the old one is over or the simulation broke; for one environment."""
     fresh = env.reset(key)
     over = (state.done > 0.5) | broken
     return jax.tree.map(lambda a, b: jnp.where(over, a, b), fresh, state)

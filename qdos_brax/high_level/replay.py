@@ -10,7 +10,7 @@ from flax import struct
 
 
 class Replay(struct.PyTreeNode):
-    """The buffer.
+    """Hold a ring buffer.
 
     Attributes:
         data: pytree of arrays [capacity, ...]; slots not yet written hold NaN (floats), so that reading one is loud.
@@ -24,7 +24,7 @@ class Replay(struct.PyTreeNode):
 
 
 def create(example: Any, capacity: int) -> Replay:
-    """An empty buffer for rows shaped like ``example`` (one transition, no leading axis)."""
+    """Return an empty buffer for rows shaped like ``example`` (one transition, no leading axis)."""
 
     def allocate(x: jax.Array) -> jax.Array:
         x = jnp.asarray(x)
@@ -36,7 +36,7 @@ def create(example: Any, capacity: int) -> Replay:
 
 
 def insert(replay: Replay, rows: Any, valid: jax.Array | None = None) -> Replay:
-    """Writes ``rows`` (leading axis n <= capacity) at the position, over the oldest.
+    """Write ``rows`` (leading axis n <= capacity) at the position, over the oldest.
 
     Args:
         replay: the buffer.
@@ -55,6 +55,6 @@ def insert(replay: Replay, rows: Any, valid: jax.Array | None = None) -> Replay:
 
 
 def sample(replay: Replay, key: jax.Array, n: int) -> Any:
-    """``n`` rows, uniformly with replacement; an empty buffer gives NaN rows."""
+    """Return ``n`` rows, uniformly with replacement; an empty buffer gives NaN rows."""
     index = jax.random.randint(key, (n,), 0, jnp.maximum(replay.size, 1))
     return jax.tree.map(lambda buffer: buffer[index], replay.data)

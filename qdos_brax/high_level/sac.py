@@ -25,7 +25,7 @@ Reference = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 class SACHyper(struct.PyTreeNode):
-    """Numbers a scan may vary: learning rate, discount per transition, Polyak rate, target entropy (nats).
+    """Hold numbers a scan may vary: learning rate, discount per transition, Polyak rate, target entropy (nats).
 
     Held against a reference, the "entropy" is minus the divergence KL(actor || reference).
     """
@@ -37,7 +37,7 @@ class SACHyper(struct.PyTreeNode):
 
 
 class SACState(struct.PyTreeNode):
-    """Everything that learns: parameters, the target ensemble, the temperature, and Adam's states."""
+    """Hold everything that learns: parameters, the target ensemble, the temperature, and Adam's states."""
 
     actor: Params
     critic: Params
@@ -49,7 +49,7 @@ class SACState(struct.PyTreeNode):
 
 
 class SAC:
-    """The learner.
+    """Learn by soft actor-critic with a critic ensemble.
 
     Args:
         observation_dim: width of observations.
@@ -75,7 +75,7 @@ class SAC:
         self._target_heads = Ensemble(config.hidden, config.target_subset)
 
     def init(self, key: jax.Array, init_temperature: jax.Array | float) -> SACState:
-        """Fresh parameters; the target ensemble starts as a copy."""
+        """Return fresh parameters; the target ensemble starts as a copy."""
         actor_key, critic_key = jax.random.split(key)
         observation = jnp.zeros((1, self.observation_dim))
         actor = self.actor.init(actor_key, observation)
@@ -92,21 +92,21 @@ class SAC:
         )
 
     def act(self, actor: Params, key: jax.Array, observation: jax.Array) -> jax.Array:
-        """A sampled action[..., action_dim] in (-1, 1)."""
+        """Return a sampled action[..., action_dim] in (-1, 1)."""
         return tanh_gaussian_sample(key, *self.actor.apply(actor, observation))[0]
 
     def mode(self, actor: Params, observation: jax.Array) -> jax.Array:
-        """The squashed mean action[..., action_dim], for evaluation."""
+        """Return the squashed mean action[..., action_dim], for evaluation."""
         return jnp.tanh(self.actor.apply(actor, observation)[0])
 
     def values(self, critic: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
-        """Q of every critic, [ensemble, ...]."""
+        """Return Q of every critic, [ensemble, ...]."""
         return self.value_scale * self.critic.apply(critic, jnp.concatenate([observation, action], axis=-1))
 
     def target_value(
         self, state: SACState, key: jax.Array, next_observation: jax.Array, reference: Reference | None = None
     ) -> jax.Array:
-        """The bootstrap value[B]: min over a random subset of target critics at the actor's action.
+        """Return the bootstrap value[B]: min over a random subset of target critics at the actor's action.
 
         Only the chosen heads are evaluated.
         """
@@ -121,7 +121,7 @@ class SAC:
         return value
 
     def critic_loss(self, critic: Params, batch: Transition, target: jax.Array) -> jax.Array:
-        """Mean over batch and sum over critics of the squared error to target[B]."""
+        """Return the mean over batch and sum over critics of the squared error to target[B]."""
         error = self.values(critic, batch.observation, batch.action) - target
         return jnp.mean(jnp.sum(error**2, axis=0))
 
@@ -141,7 +141,7 @@ class SAC:
         key: jax.Array,
         reference: Reference | None = None,
     ) -> tuple[jax.Array, jax.Array]:
-        """mean[temperature log pi(u | s) - mean_i Q_i(s, u)], and the policy's entropy estimate."""
+        """Return mean[temperature log pi(u | s) - mean_i Q_i(s, u)], and the policy's entropy estimate."""
         action, log_prob = self._sample(actor, key, observation, reference)
         value = self.values(critic, observation, action).mean(axis=0)
         return jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
@@ -149,7 +149,7 @@ class SAC:
     def update_critic(
         self, state: SACState, batch: Transition, key: jax.Array, hyper: SACHyper, reference: Reference | None = None
     ) -> tuple[SACState, dict[str, jax.Array]]:
-        """One step of every critic and of the target ensemble."""
+        """Make one step of every critic and of the target ensemble."""
         bootstrap = self.target_value(state, key, batch.next_observation, reference)
         target = jax.lax.stop_gradient(batch.reward + hyper.discount * batch.mask * bootstrap)
         loss, grads = jax.value_and_grad(self.critic_loss)(state.critic, batch, target)
@@ -166,7 +166,7 @@ class SAC:
         hyper: SACHyper,
         reference: Reference | None = None,
     ) -> tuple[SACState, dict[str, jax.Array]]:
-        """One step of the actor, then one of the temperature towards the target entropy."""
+        """Make one step of the actor, then one of the temperature towards the target entropy."""
         temperature = jnp.exp(state.log_temperature)
         (loss, entropy), grads = jax.value_and_grad(self.actor_loss, has_aux=True)(
             state.actor, state.critic, temperature, observation, key, reference

@@ -11,45 +11,45 @@ from qdos_brax.labels.rnd import RND, RNDState
 
 
 class Bonus(Protocol):
-    """A bonus; it may learn from online rows. ``hyper`` is one member's numbers by dotted key."""
+    """Define a bonus that may learn from online rows. ``hyper`` is one member's numbers by dotted key."""
 
     def init(self, key: jax.Array) -> Any:
-        """What it carries."""
+        """Return what the bonus carries between steps."""
         ...
 
     def learn(
         self, state: Any, observation: jax.Array, action: jax.Array, hyper: dict[str, jax.Array], active: jax.Array
     ) -> Any:
-        """One gradient step on online rows[B], if ``active``."""
+        """Make one gradient step on online rows[B], if ``active``."""
         ...
 
     def of(
         self, state: Any, observation: jax.Array, action: jax.Array, hyper: dict[str, jax.Array]
     ) -> jax.Array | float:
-        """What rows[B] earn beside their reward, [B] or one number for all."""
+        """Return what rows[B] earn beside their reward, [B] or one number for all."""
         ...
 
 
 class NoBonus:
-    """None (RLPD)."""
+    """Give no bonus (RLPD)."""
 
     def init(self, key: jax.Array) -> dict[str, Any]:
-        """Carries nothing."""
+        """Return nothing to carry."""
         return {}
 
     def learn(
         self, state: Any, observation: jax.Array, action: jax.Array, hyper: dict[str, jax.Array], active: jax.Array
     ) -> Any:
-        """Learns nothing."""
+        """Return ``state`` as it is."""
         return state
 
     def of(self, state: Any, observation: jax.Array, action: jax.Array, hyper: dict[str, jax.Array]) -> float:
-        """0."""
+        """Return 0."""
         return 0.0
 
 
 class RNDBonus:
-    """Random network distillation.
+    """Give the error of random network distillation as a bonus.
 
     Args:
         rnd: its networks.
@@ -59,7 +59,7 @@ class RNDBonus:
         self._rnd = rnd
 
     def init(self, key: jax.Array) -> RNDState:
-        """Fresh networks."""
+        """Return fresh networks."""
         return self._rnd.init(key)
 
     def learn(
@@ -70,11 +70,11 @@ class RNDBonus:
         hyper: dict[str, jax.Array],
         active: jax.Array,
     ) -> RNDState:
-        """One step of the predictor."""
+        """Make one step of the predictor."""
         new = self._rnd.update(state, observation, action, hyper["labels.rnd_learning_rate"])
         return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, state)
 
     def of(self, state: RNDState, observation: jax.Array, action: jax.Array, hyper: dict[str, jax.Array]) -> jax.Array:
-        """The coefficient times the predictor's error, [B]."""
+        """Return the coefficient times the predictor's error, [B]."""
         error = self._rnd.error(state.predictor, state.target, observation, action)
         return hyper["labels.rnd_coefficient"] * error

@@ -12,39 +12,39 @@ from qdos_brax.labels.reward_model import RewardModel, RewardModelState
 
 
 class OfflineReward(Protocol):
-    """A labeller: it may learn from online rows."""
+    """Define a labeller of offline rows; it may learn from online rows."""
 
     def init(self, key: jax.Array) -> Any:
-        """What it carries."""
+        """Return what the labeller carries between steps."""
         ...
 
     def learn(self, state: Any, rows: Transition, learning_rate: Any, active: jax.Array) -> Any:
-        """One gradient step on online rows[B], if ``active``."""
+        """Make one gradient step on online rows[B], if ``active``."""
         ...
 
     def label(self, state: Any, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
-        """(reward[B], mask[B]) of offline rows[B]; ``discount`` is the one within a macro step."""
+        """Return (reward[B], mask[B]) of offline rows[B]; ``discount`` is the one within a macro step."""
         ...
 
 
 class DataReward:
-    """The data set's own rewards and masks: rewards are present (the QDOS setting)."""
+    """Label rows with the data set's own rewards and masks (rewards are present: the QDOS setting)."""
 
     def init(self, key: jax.Array) -> dict[str, Any]:
-        """Carries nothing."""
+        """Return nothing to carry."""
         return {}
 
     def learn(self, state: Any, rows: Transition, learning_rate: Any, active: jax.Array) -> Any:
-        """Learns nothing."""
+        """Return ``state`` as it is."""
         return state
 
     def label(self, state: Any, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
-        """As they are."""
+        """Return the rows' own reward and mask."""
         return rows.reward, rows.mask
 
 
 class PredictedReward:
-    """The reward model's prediction, and its mask (SUPE on the kitchen; what the paper describes).
+    """Label rows with the reward model's prediction and mask (SUPE on the kitchen; what the paper describes).
 
     Args:
         model: the reward model.
@@ -54,24 +54,24 @@ class PredictedReward:
         self._model = model
 
     def init(self, key: jax.Array) -> RewardModelState:
-        """A fresh model."""
+        """Return a fresh model."""
         return self._model.init(key)
 
     def learn(
         self, state: RewardModelState, rows: Transition, learning_rate: Any, active: jax.Array
     ) -> RewardModelState:
-        """One step of both heads."""
+        """Make one step of both heads."""
         new = self._model.update(state, rows.observation, rows.action, rows.reward, rows.mask, learning_rate)
         return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, state)
 
     def label(self, state: RewardModelState, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
-        """Prediction, and the probability of going on."""
+        """Return the predicted reward, and the probability of going on as mask."""
         reward, logit = self._model.predict(state.params, rows.observation, rows.action)
         return reward, jax.nn.sigmoid(logit)
 
 
 class MinimumReward(PredictedReward):
-    """The lowest macro reward, with the model's mask (SUPE on the mazes).
+    """Label rows with the lowest macro reward and the model's mask (SUPE on the mazes).
 
     Args:
         model: the reward model.
@@ -84,6 +84,6 @@ class MinimumReward(PredictedReward):
         self._horizon, self._lowest = horizon, lowest
 
     def label(self, state: RewardModelState, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
-        """The constant, and the probability of going on."""
+        """Return the lowest macro reward, and the probability of going on as mask."""
         _, mask = super().label(state, rows, discount)
         return jnp.full_like(rows.reward, self._lowest * jnp.sum(discount ** jnp.arange(self._horizon))), mask

@@ -15,7 +15,7 @@ from qdos_brax.nn.optim import ADAM, adam_step
 
 
 class RNDState(struct.PyTreeNode):
-    """The fixed random network, the predictor that learns to imitate it, and Adam's state."""
+    """Hold the fixed random network, the predictor that learns to imitate it, and Adam's state."""
 
     target: Any
     predictor: Any
@@ -23,7 +23,7 @@ class RNDState(struct.PyTreeNode):
 
 
 class RND:
-    """The bonus.
+    """Measure novelty by random network distillation.
 
     Args:
         input_dim: width of observation and action together.
@@ -36,20 +36,20 @@ class RND:
         self._network = MLP((*hidden, features))
 
     def init(self, key: jax.Array) -> RNDState:
-        """Two independent networks."""
+        """Return two independent networks."""
         target_key, predictor_key = jax.random.split(key)
         example = jnp.zeros((1, self._input_dim))
         predictor = self._network.init(predictor_key, example)
         return RNDState(self._network.init(target_key, example), predictor, ADAM.init(predictor))
 
     def error(self, predictor: Any, target: Any, observation: jax.Array, action: jax.Array) -> jax.Array:
-        """Mean squared error over the features, [...]; the bonus is a coefficient times this."""
+        """Return the mean squared error over the features, [...]; the bonus is a coefficient times this."""
         x = jnp.concatenate([observation, action], axis=-1)
         fixed = jax.lax.stop_gradient(self._network.apply(target, x))
         return jnp.mean((self._network.apply(predictor, x) - fixed) ** 2, axis=-1)
 
     def update(self, state: RNDState, observation: jax.Array, action: jax.Array, learning_rate: Any) -> RNDState:
-        """One step of the predictor on rows[B]."""
+        """Make one step of the predictor on rows[B]."""
         grads = jax.grad(lambda p: jnp.mean(self.error(p, state.target, observation, action)))(state.predictor)
         predictor, opt_state = adam_step(state.predictor, state.opt_state, grads, learning_rate)
         return state.replace(predictor=predictor, opt_state=opt_state)

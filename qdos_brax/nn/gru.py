@@ -30,7 +30,7 @@ class _Saved(NamedTuple):
 
 
 class BidirectionalGRU(nn.Module):
-    """One layer, from the first step to the last and from the last to the first.
+    """Run one layer from the first step to the last and from the last to the first.
 
     Attributes:
         hidden: state width of each direction.
@@ -63,7 +63,9 @@ def _thirds(kernel: jax.Array) -> Gates:
 
 @jax.custom_vjp
 def project(x: jax.Array, kernels: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-    """``x[T, B, in]`` times each of ``kernels``[in, n]; the gradient by ``x`` is one matmul, not a sum of many."""
+    """Return ``x[T, B, in]`` times each of ``kernels``[in, n]; the gradient by ``x`` is one matmul, not a sum of
+    many.
+    """
     return tuple(x @ kernel for kernel in kernels)
 
 
@@ -83,7 +85,7 @@ project.defvjp(_project_forward, _project_backward)
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def recur(reverse: bool, inputs: Gates, kernels: Gates, biases: Biases) -> jax.Array:
-    """The states[T, B, hidden] after each step, from a state of zeros.
+    """Return the states[T, B, hidden] after each step, from a state of zeros.
 
     Args:
         reverse: run from the last step to the first.

@@ -17,7 +17,9 @@ EPSILON = 1e-6  # as flax's
 
 @jax.custom_vjp
 def layer_norm_relu(x: jax.Array, scale: jax.Array, bias: jax.Array) -> jax.Array:
-    """relu(scale (x - mean) / sqrt(var + 1e-6) + bias) over the last axis, [..., n], as flax's ``LayerNorm`` has it."""
+    """Return relu(scale (x - mean) / sqrt(var + 1e-6) + bias) over the last axis, [..., n], as flax's
+    ``LayerNorm`` has it.
+    """
     return _forward(x, scale, bias)[0]
 
 
@@ -45,7 +47,7 @@ layer_norm_relu.defvjp(_forward, _backward)
 
 
 class LayerNormReLU(nn.Module):
-    """``layer_norm_relu`` with its parameters, named and begun as those of flax's ``LayerNorm``."""
+    """Apply ``layer_norm_relu`` with parameters named and initialised as those of flax's ``LayerNorm``."""
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:

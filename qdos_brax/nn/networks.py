@@ -18,7 +18,7 @@ LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 
 
 class MLP(nn.Module):
-    """Dense layers with ReLU between them.
+    """Apply dense layers with ReLU between them.
 
     Attributes:
         features: widths, the last one is the output's.
@@ -38,7 +38,7 @@ class MLP(nn.Module):
 
 
 class Ensemble(nn.Module):
-    """``size`` independent MLPs with one scalar output each, evaluated as one batched matmul per layer.
+    """Apply ``size`` independent MLPs with one scalar output each, as one batched matmul per layer.
 
     Attributes:
         hidden: hidden widths.
@@ -60,7 +60,7 @@ class Ensemble(nn.Module):
 
 
 class DiagonalGaussian(nn.Module):
-    """An MLP whose output is a diagonal Gaussian.
+    """Apply an MLP whose output is a diagonal Gaussian.
 
     Attributes:
         hidden: hidden widths.
@@ -80,7 +80,7 @@ class DiagonalGaussian(nn.Module):
 
 
 class SegmentEncoder(nn.Module):
-    """The posterior q(z | tau): stacked bidirectional GRUs over (s_t, a_t), diagonal Gaussian on the last states.
+    """Encode q(z | tau): stacked bidirectional GRUs over (s_t, a_t), a diagonal Gaussian on the last states.
 
     Attributes:
         hidden: GRU width.
@@ -103,25 +103,25 @@ class SegmentEncoder(nn.Module):
 
 
 def gaussian_log_prob(x: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """log N(x; mean, exp(log_std)^2), summed over the last axis."""
+    """Return log N(x; mean, exp(log_std)^2), summed over the last axis."""
     scaled = (x - mean) * jnp.exp(-log_std)
     return -jnp.sum(0.5 * scaled**2 + log_std + 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
 
 def gaussian_kl(mean_q: jax.Array, log_std_q: jax.Array, mean_p: jax.Array, log_std_p: jax.Array) -> jax.Array:
-    """KL(q || p) of two diagonal Gaussians, summed over the last axis."""
+    """Return KL(q || p) of two diagonal Gaussians, summed over the last axis."""
     variance_ratio = jnp.exp(2 * (log_std_q - log_std_p))
     distance = ((mean_q - mean_p) * jnp.exp(-log_std_p)) ** 2
     return jnp.sum(0.5 * (variance_ratio + distance - 1) + log_std_p - log_std_q, axis=-1)
 
 
 def gaussian_sample(key: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """A reparameterised sample, the shape of ``mean``."""
+    """Return a reparameterised sample, the shape of ``mean``."""
     return mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype)
 
 
 def tanh_gaussian_sample(key: jax.Array, mean: jax.Array, log_std: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A sample of the squashed Gaussian and its log density (SAC, Haarnoja et al. 2018, appendix C).
+    """Return a sample of the squashed Gaussian and its log density (SAC, Haarnoja et al. 2018, appendix C).
 
     Returns:
         (u[..., dim] in (-1, 1), log pi(u)[...]); the log of the Jacobian is written so that it stays finite.

@@ -13,11 +13,11 @@ ADAM = optax.scale_by_adam()
 
 
 def adam_step(params: Params, opt_state: optax.OptState, grads: Params, learning_rate: Any) -> tuple[Params, Any]:
-    """One Adam step with a learning rate that may be traced: (new parameters, new optimiser state)."""
+    """Make one Adam step with a learning rate that may be traced: (new parameters, new optimiser state)."""
     updates, opt_state = ADAM.update(grads, opt_state, params)
     return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), opt_state
 
 
 def polyak(target: Params, params: Params, rate: jax.Array | float) -> Params:
-    """``target`` moved towards ``params`` by ``rate`` of the way."""
+    """Return ``target`` moved towards ``params`` by ``rate`` of the way."""
     return jax.tree.map(lambda t, p: t + rate * (p - t), target, params)

@@ -17,14 +17,14 @@ from qdos_brax.offline.rows import random_rows
 
 
 class BCState(struct.PyTreeNode):
-    """Parameters of the policy and Adam's state."""
+    """Hold parameters of the policy and Adam's state."""
 
     actor: Params
     opt_state: optax.OptState
 
 
 class BC:
-    """The learner (``qdos_brax.offline.learner.Learner``).
+    """Clone behaviour (``qdos_brax.offline.learner.Learner``).
 
     Args:
         observation_dim: width of observations.
@@ -44,18 +44,18 @@ class BC:
         self.policy = GaussianPolicy(config.hidden, action_dim, learned_std)
 
     def init(self, key: jax.Array) -> BCState:
-        """Fresh parameters."""
+        """Return fresh parameters."""
         actor = self.policy.init(key, jnp.zeros((1, self.observation_dim)))
         return BCState(actor, ADAM.init(actor))
 
     def act(self, params: dict[str, Any], observation: jax.Array) -> jax.Array:
-        """The mode of the policy, [..., act] in [-1, 1]; ``observation`` is normalised."""
+        """Return the mode of the policy, [..., act] in [-1, 1]; ``observation`` is normalised."""
         return self.policy.apply(params["actor"], observation)[0]
 
     def step(
         self, state: BCState, observation: jax.Array, action: jax.Array, learning_rate: jax.Array | float
     ) -> tuple[BCState, dict[str, jax.Array]]:
-        """One gradient step on observation[B, obs], action[B, act]."""
+        """Make one gradient step on observation[B, obs], action[B, act]."""
 
         def loss(actor: Params) -> jax.Array:
             return weighted_imitation_loss(self.policy, actor, observation, action, 1.0)
@@ -67,10 +67,10 @@ class BC:
     def update(
         self, state: BCState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]
     ) -> tuple[BCState, dict[str, jax.Array]]:
-        """One gradient step on a batch of the data; reads ``policy.learning_rate``."""
+        """Make one gradient step on a batch of the data; reads ``policy.learning_rate``."""
         rows = random_rows(data, key, self.batch_size)
         return self.step(state, data.observations[rows], data.actions[rows], hyper["policy.learning_rate"])
 
     def params(self, state: BCState) -> dict[str, Any]:
-        """{"actor"}."""
+        """Return {"actor"}."""
         return {"actor": state.actor}

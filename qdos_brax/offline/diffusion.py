@@ -29,7 +29,7 @@ _BETA_MIN, _BETA_MAX = 0.1, 10.0
 
 
 class Schedule(struct.PyTreeNode):
-    """How noise is added in K steps, float32[K] each; entry k belongs to step k + 1.
+    """Hold how noise is added in K steps, float32[K] each; entry k belongs to step k + 1.
 
     Attributes:
         beta: variance that the step adds.
@@ -43,7 +43,8 @@ class Schedule(struct.PyTreeNode):
 
 
 def variance_preserving_schedule(steps: int) -> Schedule:
-    """alpha_bar(t) = exp(-b_min t - (b_max - b_min) t^2 / 2) at t = 1/K .. 1 (Xiao et al. 2022), b from 0.1 to 10.
+    """Return alpha_bar(t) = exp(-b_min t - (b_max - b_min) t^2 / 2) at t = 1/K .. 1 (Xiao et al. 2022), b from 0.1
+    to 10.
 
     Args:
         steps: K, at least 1.
@@ -56,13 +57,13 @@ def variance_preserving_schedule(steps: int) -> Schedule:
 
 
 def add_noise(schedule: Schedule, action: jax.Array, step: jax.Array, noise: jax.Array) -> jax.Array:
-    """The action after step + 1 noising steps: sqrt(alpha_bar) a + sqrt(1 - alpha_bar) noise; ``step`` is int32[B]."""
+    """Return the action after step + 1 noising steps: sqrt(alpha_bar) a + sqrt(1 - alpha_bar) noise; ``step`` is int32[B]."""
     alpha_bar = schedule.alpha_bar[step][..., None]
     return jnp.sqrt(alpha_bar) * action + jnp.sqrt(1 - alpha_bar) * noise
 
 
 class Denoiser(nn.Module):
-    """Predicts the noise in an action: Fourier features of the step, then residual blocks.
+    """Predict the noise in an action: Fourier features of the step, then residual blocks.
 
     Attributes:
         hidden: width of the blocks.
@@ -92,7 +93,7 @@ class Denoiser(nn.Module):
 
 
 class DiffusionState(struct.PyTreeNode):
-    """Parameters of the denoiser, their moving average, and Adam's state."""
+    """Hold parameters of the denoiser, their moving average, and Adam's state."""
 
     denoiser: Params
     average: Params
@@ -100,14 +101,14 @@ class DiffusionState(struct.PyTreeNode):
 
 
 class DiffusionHyper(struct.PyTreeNode):
-    """Numbers a scan may vary: learning rate, and the rate at which the average follows the parameters."""
+    """Hold numbers a scan may vary: learning rate, and the rate at which the average follows the parameters."""
 
     learning_rate: jax.Array | float
     average_rate: jax.Array | float
 
 
 class DiffusionBC:
-    """The learner (``qdos_brax.offline.learner.Learner``).
+    """Clone behaviour by a diffusion policy (``qdos_brax.offline.learner.Learner``).
 
     Args:
         observation_dim: width of observations.
@@ -131,13 +132,13 @@ class DiffusionBC:
         self._denoiser = Denoiser(config.hidden, blocks, action_dim, dropout)
 
     def init(self, key: jax.Array) -> DiffusionState:
-        """Fresh parameters; the average starts as a copy."""
+        """Return fresh parameters; the average starts as a copy."""
         observation, action = jnp.zeros((1, self.observation_dim)), jnp.zeros((1, self.action_dim))
         denoiser = self._denoiser.init(key, observation, action, jnp.zeros(1), False)
         return DiffusionState(denoiser, jax.tree.map(jnp.copy, denoiser), ADAM.init(denoiser))
 
     def loss(self, denoiser: Params, observation: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
-        """mean_i ||noise - predicted noise||^2 at a random step each (Ho et al. 2020, eq. 14)."""
+        """Return mean_i ||noise - predicted noise||^2 at a random step each (Ho et al. 2020, eq. 14)."""
         step_key, noise_key, dropout_key = jax.random.split(key, 3)
         step = jax.random.randint(step_key, action.shape[:-1], 0, self.steps)
         noise = jax.random.normal(noise_key, action.shape)
@@ -148,14 +149,14 @@ class DiffusionBC:
     def step(
         self, state: DiffusionState, observation: jax.Array, action: jax.Array, key: jax.Array, hyper: DiffusionHyper
     ) -> tuple[DiffusionState, dict[str, jax.Array]]:
-        """One gradient step on observation[B, obs], action[B, act]; the average follows."""
+        """Make one gradient step on observation[B, obs], action[B, act]; the average follows."""
         loss, grads = jax.value_and_grad(self.loss)(state.denoiser, observation, action, key)
         denoiser, opt_state = adam_step(state.denoiser, state.opt_state, grads, hyper.learning_rate)
         average = polyak(state.average, denoiser, hyper.average_rate)
         return DiffusionState(denoiser, average, opt_state), {"denoising_loss": loss}
 
     def sample(self, params: dict[str, Any], key: jax.Array, observation: jax.Array) -> jax.Array:
-        """An action[..., act] in [-1, 1] of pi(a | s), by K denoising steps; ``observation`` is normalised.
+        """Return an action[..., act] in [-1, 1] of pi(a | s), by K denoising steps; ``observation`` is normalised.
 
         Each step estimates the clean action, clips it into the box, and draws the step back given that estimate
         (Ho et al. 2020, eq. 6 and 7).
@@ -182,12 +183,12 @@ class DiffusionBC:
     def update(
         self, state: DiffusionState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]
     ) -> tuple[DiffusionState, dict[str, jax.Array]]:
-        """One gradient step on a batch of the data; reads ``guide.learning_rate`` and ``.average_rate``."""
+        """Make one gradient step on a batch of the data; reads ``guide.learning_rate`` and ``.average_rate``."""
         rows_key, loss_key = jax.random.split(key)
         rows = random_rows(data, rows_key, self.batch_size)
         own = DiffusionHyper(hyper["guide.learning_rate"], hyper["guide.average_rate"])
         return self.step(state, data.observations[rows], data.actions[rows], loss_key, own)
 
     def params(self, state: DiffusionState) -> dict[str, Any]:
-        """{"denoiser"}: the average."""
+        """Return {"denoiser"}: the average."""
         return {"denoiser": state.average}

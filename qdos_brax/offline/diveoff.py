@@ -37,7 +37,7 @@ _ACTION_STD = 0.082  # exp(-2.5), of the action whose value the critic is traine
 
 
 class DiveOffHyper(struct.PyTreeNode):
-    """Numbers a scan may vary.
+    """Hold numbers a scan may vary.
 
     Attributes:
         learning_rate: Adam's, of actor and critic.
@@ -61,7 +61,7 @@ class DiveOffHyper(struct.PyTreeNode):
 
 
 class DiveOffState(struct.PyTreeNode):
-    """Parameters of all networks, targets, Adam's state, and the updates done.
+    """Hold parameters of all networks, targets, Adam's state, and the updates done.
 
     ``shared_opt_state`` are those of the step on encoder, decoder and actor together.
     """
@@ -78,7 +78,7 @@ class DiveOffState(struct.PyTreeNode):
 
 
 class DiveOff:
-    """The learner (``qdos_brax.offline.learner.Learner``).
+    """Learn diverse and good latents of transitions (``qdos_brax.offline.learner.Learner``).
 
     Args:
         observation_dim: width of observations.
@@ -97,7 +97,7 @@ class DiveOff:
         self._decoder = MLP((*config.hidden, observation_dim + action_dim))
 
     def init(self, key: jax.Array) -> DiveOffState:
-        """Fresh parameters; the targets start as copies."""
+        """Return fresh parameters; the targets start as copies."""
         actor_key, critic_key, encoder_key, decoder_key = jax.random.split(key, 4)
         pair, latent = jnp.zeros((1, self.observation_dim + self.action_dim)), jnp.zeros((1, self.latent_dim))
         actor = self.policy.init(actor_key, jnp.zeros((1, self.observation_dim + self.latent_dim)))
@@ -121,32 +121,34 @@ class DiveOff:
     # --- What it gives to others, from ``params`` ------------------------------------------------------------
 
     def act(self, params: dict[str, Any], observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The mode of pi(a | s, z), [..., act] in [-1, 1]; ``observation`` is normalised."""
+        """Return the mode of pi(a | s, z), [..., act] in [-1, 1]; ``observation`` is normalised."""
         return self._mean_action(params["actor"], observation, latent)
 
     def encode(self, params: dict[str, Any], observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """q(z | s, a): (mean[..., latent], log standard deviation[..., latent])."""
+        """Return q(z | s, a): (mean[..., latent], log standard deviation[..., latent])."""
         return self._encoder.apply(params["encoder"], jnp.concatenate([observation, action], axis=-1))
 
     def prior(self, params: dict[str, Any], observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """p(z), standard normal in every state: (mean[..., latent], log standard deviation[..., latent])."""
+        """Return p(z), standard normal in every state: (mean[..., latent], log standard deviation[..., latent])."""
         zeros = jnp.zeros((*observation.shape[:-1], self.latent_dim))
         return zeros, zeros
 
     def params(self, state: DiveOffState) -> dict[str, Any]:
-        """{"actor", "encoder"}."""
+        """Return {"actor", "encoder"}."""
         return {"actor": state.actor, "encoder": state.autoencoder["encoder"]}
 
     # --- Learning --------------------------------------------------------------------------------------------
 
     def q(self, critic: Params, observation: jax.Array, action: jax.Array, latent: jax.Array) -> jax.Array:
-        """Q(s, a, z) of both heads, [2, B]."""
+        """Return Q(s, a, z) of both heads, [2, B]."""
         return self._critic.apply(critic, jnp.concatenate([observation, action, latent], axis=-1))
 
     def critic_step(
         self, state: DiveOffState, batch: ValueBatch, key: jax.Array, hyper: DiveOffHyper
     ) -> tuple[DiveOffState, jax.Array]:
-        """One step of the critic to r + discount min Q(s', a', z), z ~ q(z | s, a), a' ~ pi(. | s', z); its loss."""
+        """Make one step of the critic to r + discount min Q(s', a', z), z ~ q(z | s, a), a' ~ pi(. | s', z); its
+        loss.
+        """
         latent_key, action_key = jax.random.split(key)
         latent = gaussian_sample(latent_key, *self.encode(state.autoencoder, batch.observation, batch.action))
         action = self._target_action(state, batch.next_observation, latent, action_key)
@@ -162,7 +164,7 @@ class DiveOff:
         return state.replace(critic=critic, critic_opt_state=opt_state), value
 
     def advantage(self, state: DiveOffState, batch: ValueBatch, latent: jax.Array, key: jax.Array) -> jax.Array:
-        """min Q(s, a, z) - min Q(s, a', z) with a' ~ pi(. | s, z), [B], all of the targets."""
+        """Return min Q(s, a, z) - min Q(s, a', z) with a' ~ pi(. | s, z), [B], all of the targets."""
         own = self._target_action(state, batch.observation, latent, key)
         logged = self.q(state.target_critic, batch.observation, batch.action, latent).min(axis=0)
         return logged - self.q(state.target_critic, batch.observation, own, latent).min(axis=0)
@@ -170,7 +172,7 @@ class DiveOff:
     def autoencoder_loss(
         self, autoencoder: Params, batch: ValueBatch, weight: jax.Array, sharpness: jax.Array, key: jax.Array, kl: Any
     ) -> jax.Array:
-        """mean_i w_i [mean squared error of (s, a) + beta KL(q || N(0, 1))] - v_i log q(z_i | s_i, a_i).
+        """Return mean_i w_i [mean squared error of (s, a) + beta KL(q || N(0, 1))] - v_i log q(z_i | s_i, a_i).
 
         Args:
             autoencoder: {"encoder", "decoder"}.
@@ -189,7 +191,7 @@ class DiveOff:
         return jnp.mean(weight * (error + kl * divergence) - sharpness * sharp)
 
     def information_loss(self, encoder: Params, actor: Params, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """mean squared error of z as encoded from (s, pi(s, z)), for ``latent``[B, d] at logged states."""
+        """Return mean squared error of z as encoded from (s, pi(s, z)), for ``latent``[B, d] at logged states."""
         action = self._mean_action(actor, observation, latent)
         recovered = self.encode({"encoder": encoder}, observation, action)[0]
         return jnp.mean((recovered - latent) ** 2)
@@ -197,7 +199,7 @@ class DiveOff:
     def policy_step(
         self, state: DiveOffState, batch: ValueBatch, key: jax.Array, hyper: DiveOffHyper
     ) -> tuple[DiveOffState, dict[str, jax.Array]]:
-        """One step of the actor, one of autoencoder and actor on information, and one of the targets."""
+        """Make one step of the actor, one of autoencoder and actor on information, and one of the targets."""
         latent_key, action_key, sample_key, random_key = jax.random.split(key, 4)
         latent = gaussian_sample(latent_key, *self.encode(state.autoencoder, batch.observation, batch.action))
         started = (state.count >= self.autoencoder_updates).astype(jnp.float32)
@@ -238,7 +240,7 @@ class DiveOff:
     def update(
         self, state: DiveOffState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]
     ) -> tuple[DiveOffState, dict[str, jax.Array]]:
-        """Two critic steps and one of everything else, on batches of the data.
+        """Make two critic steps and one of everything else, on batches of the data.
 
         Reads ``diveoff.learning_rate``, ``.autoencoder_rate``, ``.discount``, ``.target_rate``, ``.scale``,
         ``.kl_weight``, ``.information`` and ``skills.latent_box``.

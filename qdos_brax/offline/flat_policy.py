@@ -13,7 +13,7 @@ from qdos_brax.data.device import Normaliser
 
 @dataclass(frozen=True)
 class FlatPolicy:
-    """A policy that decides at every step (``qdos_brax.high_level.agent.Policy`` with H = 1): a decision is an action.
+    """Decide at every step (``qdos_brax.high_level.agent.Policy`` with H = 1): a decision is an action.
 
     Attributes:
         normaliser: of observations.
@@ -26,9 +26,9 @@ class FlatPolicy:
     params: Any
 
     def choose(self, observation: jax.Array) -> jax.Array:
-        """The action[..., act] at observation[..., obs]."""
+        """Return the action[..., act] at observation[..., obs]."""
         return self.act(self.params, self.normaliser(observation))
 
     def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The decision itself."""
+        """Return the decision itself."""
         return latent

@@ -30,7 +30,7 @@ _HEADS = 2  # phi and its twin; skills and distances are those of the first
 
 
 class GoalBatch(NamedTuple):
-    """Transitions with goals, leading axis B; ``reached``[B] is 1 where the state is its goal."""
+    """Hold transitions with goals, leading axis B; ``reached``[B] is 1 where the state is its goal."""
 
     observation: jax.Array
     action: jax.Array
@@ -40,7 +40,7 @@ class GoalBatch(NamedTuple):
 
 
 class HilbertHyper(struct.PyTreeNode):
-    """Numbers a scan may vary.
+    """Hold numbers a scan may vary.
 
     Attributes:
         learning_rate: Adam's, of all networks.
@@ -60,7 +60,7 @@ class HilbertHyper(struct.PyTreeNode):
 
 
 class HilbertState(struct.PyTreeNode):
-    """phi's two heads (first axis of every leaf), their target, Adam's state, and the learner of skills."""
+    """Hold phi's two heads (first axis of every leaf), their target, Adam's state, and the learner of skills."""
 
     phi: Params
     target_phi: Params
@@ -71,7 +71,7 @@ class HilbertState(struct.PyTreeNode):
 def goal_rows(
     data: DeviceData, rows: jax.Array, key: jax.Array, discount: jax.Array | float, random_share: jax.Array | float
 ) -> jax.Array:
-    """int32[B], a goal for each of ``rows``[B]: a later row of its episode, or any row of the data.
+    """Return int32[B], a goal for each of ``rows``[B]: a later row of its episode, or any row of the data.
 
     Args:
         data: the data set.
@@ -89,7 +89,7 @@ def goal_rows(
 
 
 class Hilbert:
-    """The learner (``qdos_brax.offline.learner.Learner``): phi and the skills, one step each per update.
+    """Learn phi and its skills, one step each per update (``qdos_brax.offline.learner.Learner``).
 
     Args:
         observation_dim: width of observations.
@@ -107,7 +107,7 @@ class Hilbert:
         self.skills = IQLPolicy(width, action_dim, policy, IQL(width, action_dim, config.hidden))
 
     def init(self, key: jax.Array) -> HilbertState:
-        """Fresh parameters; the target starts as a copy."""
+        """Return fresh parameters; the target starts as a copy."""
         phi_key, skills_key = jax.random.split(key)
         heads = jax.random.split(phi_key, _HEADS)
         phi = jax.vmap(self._phi.init, in_axes=(0, None))(heads, jnp.zeros((1, self.observation_dim)))
@@ -116,34 +116,35 @@ class Hilbert:
     # --- What it gives to others, from ``params`` ------------------------------------------------------------
 
     def represent(self, params: dict[str, Any], observation: jax.Array) -> jax.Array:
-        """phi(s), [..., latent]; ``observation`` is normalised."""
+        """Return phi(s), [..., latent]; ``observation`` is normalised."""
         return self._first(params["phi"], observation)
 
     def direction(self, params: dict[str, Any], start: jax.Array, end: jax.Array) -> jax.Array:
-        """The skill that leads from observation ``start`` to ``end``[..., obs]: phi(end) - phi(start) of length 1.
+        """Return the skill that leads from observation ``start`` to ``end``[..., obs]: phi(end) - phi(start) of
+        length 1.
 
         Where the two coincide it is 0.
         """
         return unit_vector(self.represent(params, end) - self.represent(params, start))
 
     def act(self, params: dict[str, Any], observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The mode of pi(a | s, z), [..., act] in [-1, 1]."""
+        """Return the mode of pi(a | s, z), [..., act] in [-1, 1]."""
         return self.skills.act({"actor": params["policy"]}, jnp.concatenate([observation, latent], axis=-1))
 
     def params(self, state: HilbertState) -> dict[str, Any]:
-        """{"phi", "policy"}."""
+        """Return {"phi", "policy"}."""
         return {"phi": state.phi, "policy": state.skills.actor}
 
     # --- Learning --------------------------------------------------------------------------------------------
 
     def distance(self, phi: Params, observation: jax.Array, goal: jax.Array) -> jax.Array:
-        """||phi(s) - phi(g)|| of both heads, [2, B], at least 1e-3 (where its gradient would not be finite)."""
+        """Return ||phi(s) - phi(g)|| of both heads, [2, B], at least 1e-3 (where its gradient would not be finite)."""
         both = jax.vmap(self._phi.apply, in_axes=(0, None))
         squared = jnp.sum((both(phi, observation) - both(phi, goal)) ** 2, axis=-1)
         return jnp.sqrt(jnp.maximum(squared, 1e-6))
 
     def distance_loss(self, phi: Params, target_phi: Params, batch: GoalBatch, hyper: HilbertHyper) -> jax.Array:
-        """Expectile regression of V = -distance to -1 + discount V(s', g), each head to its own target.
+        """Return the loss of the expectile regression of V = -distance to -1 + discount V(s', g), each head to its own target.
 
         The side of the expectile is that of the smaller next value against the mean of the heads, both of the target.
         """
@@ -156,7 +157,7 @@ class Hilbert:
         return jnp.mean(jnp.sum(weight * error**2, axis=0))
 
     def skill_batch(self, phi: Params, batch: GoalBatch, latent: jax.Array, discount: jax.Array | float) -> ValueBatch:
-        """The transitions as skills z = ``latent``[B, d] see them: never ending, reward <phi(s') - phi(s), z>."""
+        """Return the transitions as skills z = ``latent``[B, d] see them: never ending, reward <phi(s') - phi(s), z>."""
         moved = self._first(phi, batch.next_observation) - self._first(phi, batch.observation)
         return ValueBatch(
             observation=jnp.concatenate([batch.observation, latent], axis=-1),
@@ -169,7 +170,7 @@ class Hilbert:
     def step(
         self, state: HilbertState, batch: GoalBatch, latent: jax.Array, hyper: HilbertHyper
     ) -> tuple[HilbertState, dict[str, jax.Array]]:
-        """One step of phi and its target on ``batch``, and one of the skills ``latent``[B, d] on its transitions."""
+        """Make one step of phi and its target on ``batch``, and one of the skills ``latent``[B, d] on its transitions."""
         loss, grads = jax.value_and_grad(self.distance_loss)(state.phi, state.target_phi, batch, hyper)
         phi, opt_state = adam_step(state.phi, state.phi_opt_state, grads, hyper.learning_rate)
         target_phi = polyak(state.target_phi, phi, hyper.target_rate)
@@ -182,7 +183,7 @@ class Hilbert:
     def update(
         self, state: HilbertState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]
     ) -> tuple[HilbertState, dict[str, jax.Array]]:
-        """One step on a batch of the data with random goals and random skills.
+        """Make one step on a batch of the data with random goals and random skills.
 
         Reads ``hilbert.learning_rate``, ``.expectile``, ``.skill_expectile``, ``.discount``, ``.target_rate`` and
         ``.inverse_temperature``.
@@ -205,5 +206,5 @@ class Hilbert:
 
 
 def random_directions(key: jax.Array, size: int, dim: int) -> jax.Array:
-    """float32[size, dim], uniform on the unit sphere."""
+    """Return float32[size, dim], uniform on the unit sphere."""
     return unit_vector(jax.random.normal(key, (size, dim)))

@@ -24,7 +24,9 @@ WEIGHT_CLIP = 100.0  # the largest weight of a transition (paper, section 5 and 
 
 
 class IQLPolicyHyper(struct.PyTreeNode):
-    """Numbers a scan may vary: the values' own, the policy's learning rate, and beta of its weights exp(beta A)."""
+    """Hold numbers a scan may vary: the values' own, the policy's learning rate, and beta of its weights exp(beta
+    A).
+    """
 
     values: ValueHyper
     learning_rate: jax.Array | float
@@ -32,7 +34,7 @@ class IQLPolicyHyper(struct.PyTreeNode):
 
 
 class IQLPolicyState(struct.PyTreeNode):
-    """Values, the policy's parameters, and Adam's states."""
+    """Hold values, the policy's parameters, and Adam's states."""
 
     values: ValueState
     actor: Params
@@ -40,12 +42,12 @@ class IQLPolicyState(struct.PyTreeNode):
 
 
 def regression_weight(advantage: jax.Array, inverse_temperature: jax.Array | float) -> jax.Array:
-    """min(exp(beta A), 100), [B], no gradient (paper, eq. 7)."""
+    """Return min(exp(beta A), 100), [B], no gradient (paper, eq. 7)."""
     return jax.lax.stop_gradient(jnp.minimum(jnp.exp(inverse_temperature * advantage), WEIGHT_CLIP))
 
 
 class IQLPolicy:
-    """The learner (``qdos_brax.offline.learner.Learner``).
+    """Learn IQL's values and policy (``qdos_brax.offline.learner.Learner``).
 
     Args:
         observation_dim: width of observations.
@@ -60,24 +62,24 @@ class IQLPolicy:
         self.policy = GaussianPolicy(config.hidden, action_dim)
 
     def init(self, key: jax.Array) -> IQLPolicyState:
-        """Fresh parameters."""
+        """Return fresh parameters."""
         values_key, actor_key = jax.random.split(key)
         actor = self.policy.init(actor_key, jnp.zeros((1, self.observation_dim)))
         return IQLPolicyState(self.values.init(values_key), actor, ADAM.init(actor))
 
     def act(self, params: dict[str, Any], observation: jax.Array) -> jax.Array:
-        """The mode of the policy, [..., act] in [-1, 1]; ``observation`` is normalised."""
+        """Return the mode of the policy, [..., act] in [-1, 1]; ``observation`` is normalised."""
         return self.policy.apply(params["actor"], observation)[0]
 
     def advantage(self, values: ValueState, observation: jax.Array, action: jax.Array) -> jax.Array:
-        """min Q(s, a) - V(s), [B], with the target critic's heads."""
+        """Return min Q(s, a) - V(s), [B], with the target critic's heads."""
         q = self.values.q(values.target_critic, observation, action).min(axis=0)
         return q - self.values.value(values.value, observation)
 
     def step(
         self, state: IQLPolicyState, batch: ValueBatch, hyper: IQLPolicyHyper
     ) -> tuple[IQLPolicyState, dict[str, jax.Array]]:
-        """One step of V, Q, their target and the policy."""
+        """Make one step of V, Q, their target and the policy."""
         values, info = self.values.update(state.values, batch, hyper.values)
         advantage = self.advantage(values, batch.observation, batch.action)
         weight = regression_weight(advantage, hyper.inverse_temperature)
@@ -93,7 +95,7 @@ class IQLPolicy:
     def update(
         self, state: IQLPolicyState, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]
     ) -> tuple[IQLPolicyState, dict[str, jax.Array]]:
-        """One step on a batch of the data.
+        """Make one step on a batch of the data.
 
         Reads ``values.learning_rate``, ``.expectile``, ``.target_rate``, ``.discount``, ``policy.learning_rate`` and
         ``policy.inverse_temperature``.
@@ -104,5 +106,5 @@ class IQLPolicy:
         return self.step(state, batch, own)
 
     def params(self, state: IQLPolicyState) -> dict[str, Any]:
-        """{"actor"}."""
+        """Return {"actor"}."""
         return {"actor": state.actor}

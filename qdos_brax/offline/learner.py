@@ -10,16 +10,16 @@ from qdos_brax.data.device import DeviceData
 
 
 class Learner(Protocol):
-    """A learner on the data set; everything it does is of one member of the population and can be jitted."""
+    """Define a learner on the data set; everything it does is of one member of the population and can be jitted."""
 
     def init(self, key: jax.Array) -> Any:
-        """Its state, a pytree of arrays."""
+        """Return its state, a pytree of arrays."""
         ...
 
     def update(
         self, state: Any, data: DeviceData, key: jax.Array, hyper: dict[str, jax.Array]
     ) -> tuple[Any, dict[str, jax.Array]]:
-        """One gradient step of everything that learns, on a batch that it draws from ``data`` with ``key``.
+        """Make one gradient step of everything that learns, on a batch that it draws from ``data`` with ``key``.
 
         Args:
             state: as ``init`` made it.
@@ -33,13 +33,13 @@ class Learner(Protocol):
         ...
 
     def params(self, state: Any) -> dict[str, Any]:
-        """What the phases after and the evaluation need: nested dicts with text keys."""
+        """Return what the phases after and the evaluation need: nested dicts with text keys."""
         ...
 
 
 class PolicyLearner(Learner, Protocol):
-    """A learner of a policy that decides at every step."""
+    """Define a learner of a policy that decides at every step."""
 
     def act(self, params: dict[str, Any], observation: jax.Array) -> jax.Array:
-        """The policy's mode, [..., act] in [-1, 1], at normalised observations[..., obs]."""
+        """Return the policy's mode, [..., act] in [-1, 1], at normalised observations[..., obs]."""
         ...

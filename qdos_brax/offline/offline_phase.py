@@ -21,7 +21,7 @@ from qdos_brax.population.phase import MemberPhase
 
 
 class OfflinePhaseState(struct.PyTreeNode):
-    """What the phase carries, every leaf [members, ...]; healthy: False once a learned number is not finite."""
+    """Hold what the phase carries, every leaf [members, ...]; healthy: False once a learned number is not finite."""
 
     key: jax.Array
     learner: Any
@@ -30,7 +30,7 @@ class OfflinePhaseState(struct.PyTreeNode):
 
 
 class Evaluation:
-    """Episodes of what a learner has learned so far.
+    """Play episodes with what a learner has learned so far.
 
     Args:
         env: the task.
@@ -53,7 +53,7 @@ class Evaluation:
 
 
 class OfflinePhase(MemberPhase):
-    """Gradient steps of a learner on the data set.
+    """Make gradient steps of a learner on the data set.
 
     Args:
         name: of the phase, and of what it leaves.

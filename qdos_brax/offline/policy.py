@@ -14,7 +14,7 @@ Params = dict[str, dict[str, jax.Array]]
 
 
 class GaussianPolicy(nn.Module):
-    """pi(a | s) = N(tanh(MLP(s)), sigma^2): mean inside the action box, one sigma per action dimension (IQL's actor).
+    """Compute pi(a | s) = N(tanh(MLP(s)), sigma^2): mean in the action box, one sigma per dimension (IQL's actor).
 
     Attributes:
         hidden: hidden widths.
@@ -39,5 +39,5 @@ class GaussianPolicy(nn.Module):
 def weighted_imitation_loss(
     policy: GaussianPolicy, params: Params, observation: jax.Array, action: jax.Array, weight: jax.Array | float
 ) -> jax.Array:
-    """-mean_i w_i log pi(a_i | s_i)."""
+    """Return -mean_i w_i log pi(a_i | s_i)."""
     return -jnp.mean(weight * gaussian_log_prob(action, *policy.apply(params, observation)))

@@ -17,12 +17,12 @@ KEY = "healthy"  # among the artifacts: bool[members]
 
 
 def inherited(artifacts: Mapping[str, Any], members: int) -> jax.Array:
-    """bool[members], False for whom an earlier phase froze."""
+    """Return bool[members], False for whom an earlier phase froze."""
     return jnp.array(artifacts.get(KEY, np.ones(members, bool)))  # a copy: phases donate their states
 
 
 def keep_finite(healthy: jax.Array, new: T, old: T) -> tuple[T, jax.Array]:
-    """One member's state after a step, and whether the member is still healthy.
+    """Return one member's state after a step, and whether the member is still healthy.
 
     Args:
         healthy: bool, whether it was so before.

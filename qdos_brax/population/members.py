@@ -19,7 +19,7 @@ _AXIS = "members"
 
 
 class Population:
-    """The members of a run, and how what is written for one of them is run for all.
+    """Run what is written for one member for all members of a run.
 
     With one member at a time on each device, a member's numbers do not depend on its company: the compiled program is
     that of a run of the member alone.
@@ -51,11 +51,11 @@ class Population:
         self.hyper = {key: jnp.asarray(value) for key, value in hyper.items()}
 
     def shared(self, tree: Any) -> Any:
-        """What all members read (the data set), on every device."""
+        """Return what all members read (the data set), on every device."""
         return tree if len(self.devices) == 1 else jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec()))
 
     def program(self, function: Callable[..., Any], carries: bool = False) -> Callable[..., Any]:
-        """``function(*member_trees, shared)`` of one member, compiled for trees with a leading member axis.
+        """Return ``function(*member_trees, shared)`` of one member, compiled for trees with a leading member axis.
 
         Args:
             function: its last argument is what all members share, the others are one member's own.
@@ -98,7 +98,7 @@ class Population:
 
 
 def over_members(function: Callable[..., Any], members: int) -> Callable[..., Any]:
-    """``function(*member_trees, shared)`` for one member, made to act on trees with a leading member axis.
+    """Return ``function(*member_trees, shared)`` for one member, made to act on trees with a leading member axis.
 
     With one member the axis is taken off and put back instead of mapped, so that branches stay branches and matmuls
     keep their shapes.

@@ -22,7 +22,7 @@ _GB = 1e9
 
 
 class Sized(Protocol):
-    """A phase whose memory can be told before it runs."""
+    """Define a phase whose memory can be told before it runs."""
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[Any, Any]:
         """Return the state before the first chunk, and the constants of all chunks."""
@@ -33,13 +33,13 @@ class Sized(Protocol):
         ...
 
     def finish(self, state: Any, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """What the next phases need."""
+        """Return what the next phases need."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes.
+    """Hold an estimate of memory, in bytes.
 
     Attributes:
         shared: the data set, once per device.
@@ -54,7 +54,7 @@ class MemoryEstimate:
 
 @dataclasses.dataclass(frozen=True)
 class MemoryPlan:
-    """How the members run.
+    """Hold how the members run.
 
     Attributes:
         devices: that they are spread over.
@@ -70,7 +70,7 @@ class MemoryPlan:
 
 
 def estimate(phases: Sequence[Sized], shared: int) -> MemoryEstimate:
-    """The largest need of the phases of a population of one; nothing is compiled and nothing runs.
+    """Return the largest need of the phases of a population of one; nothing is compiled and nothing runs.
 
     Args:
         phases: in order; they are of no use afterwards, since what they hold are shapes.
@@ -89,7 +89,7 @@ def estimate(phases: Sequence[Sized], shared: int) -> MemoryEstimate:
 
 
 def plan(need: MemoryEstimate, members: int, devices: Sequence[jax.Device], room: int, wanted: int) -> MemoryPlan:
-    """How ``members`` run on ``devices``.
+    """Return how ``members`` run on ``devices``.
 
     Args:
         need: of the run.
@@ -127,7 +127,7 @@ def plan(need: MemoryEstimate, members: int, devices: Sequence[jax.Device], room
 
 
 def room_of(device: jax.Device) -> int:
-    """Bytes that the device may use; of a CPU, what the host has left."""
+    """Return bytes that the device may use; of a CPU, what the host has left."""
     if device.platform != "cpu":
         return int((device.memory_stats() or {}).get("bytes_limit", 0)) or 2**63
     lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines())
@@ -135,12 +135,13 @@ def room_of(device: jax.Device) -> int:
 
 
 def num_bytes(tree: Any) -> int:
-    """Of all arrays of the tree, or of what has their shapes."""
+    """Return the bytes of all arrays of the tree, or of what has their shapes."""
     return sum(_bytes(leaf) for leaf in jax.tree.leaves(tree))
 
 
 def working_bytes(program: Any, *args: Any) -> int:
-    """What a program needs at most beside its arguments, if what it is done with is freed at once and nothing fused.
+    """Return what a program needs at most beside its arguments, if what it is done with is freed at once and
+    nothing fused.
 
     Its first argument is given up for the first of its results.
     """

@@ -66,7 +66,8 @@ class GraphPhase(MemberPhase):
 
 
 def graph_costs(values: ValuesConfig, horizon: int, data: DeviceData, ends: np.ndarray) -> np.ndarray:
-    """float32[N], the cost of the way to success from every logged state; all 0, and a line says so, if there is none.
+    """Return float32[N], the cost of the way to success from every logged state; all 0, and a line says so, if
+    there is none.
 
     Args:
         values: how the graph is made.

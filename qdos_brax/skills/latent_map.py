@@ -11,46 +11,46 @@ MARGIN = 1e-5  # labels stay this far inside the box, where arctanh and the acto
 
 
 class Prior(NamedTuple):
-    """p(z | s) where the skill starts: mean[..., d] and log standard deviation[..., d]."""
+    """Hold p(z | s) where the skill starts: mean[..., d] and log standard deviation[..., d]."""
 
     mean: jax.Array
     log_std: jax.Array
 
 
 class LatentMap(Protocol):
-    """A bijection of (-1, 1)^d onto the latents that the high level can play in a state."""
+    """Define a bijection of (-1, 1)^d onto the latents that the high level can play in a state."""
 
     def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
-        """z[..., d] of u[..., d]."""
+        """Return z[..., d] of u[..., d]."""
         ...
 
     def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
-        """u[..., d] of z[..., d], clipped into the box."""
+        """Return u[..., d] of z[..., d], clipped into the box."""
         ...
 
     def log_jacobian(self, action: jax.Array, prior: Prior) -> jax.Array:
-        """log |dz / du| [...], summed over the d dimensions."""
+        """Return log |dz / du| [...], summed over the d dimensions."""
         ...
 
 
 class ArctanhMap:
-    """z = arctanh(u): every latent can be played (SUPE)."""
+    """Map by z = arctanh(u): every latent can be played (SUPE)."""
 
     def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
-        """z = arctanh(u)."""
+        """Return z = arctanh(u)."""
         return jnp.arctanh(_inside(action))
 
     def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
-        """u = tanh(z)."""
+        """Return u = tanh(z)."""
         return _inside(jnp.tanh(latent))
 
     def log_jacobian(self, action: jax.Array, prior: Prior) -> jax.Array:
-        """-sum log(1 - u^2)."""
+        """Return -sum log(1 - u^2)."""
         return -jnp.sum(jnp.log1p(-(_inside(action) ** 2)), axis=-1)
 
 
 class BoxMap:
-    """z = c u: the box that random skills are drawn from in pretraining.
+    """Map by z = c u: the box that random skills are drawn from in pretraining.
 
     Args:
         half_side: c, a number or an array that broadcasts to the latents.
@@ -60,20 +60,20 @@ class BoxMap:
         self._half_side = half_side
 
     def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
-        """z = c u."""
+        """Return z = c u."""
         return self._half_side * action
 
     def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
-        """u = z / c."""
+        """Return u = z / c."""
         return _inside(latent / self._half_side)
 
     def log_jacobian(self, action: jax.Array, prior: Prior) -> jax.Array:
-        """d log c."""
+        """Return d log c."""
         return jnp.sum(jnp.broadcast_to(jnp.log(self._half_side), action.shape), axis=-1)
 
 
 class PriorMap:
-    """z = mean(s) + c std(s) u: the skills that the prior holds for likely in this state.
+    """Map by z = mean(s) + c std(s) u: the skills that the prior holds for likely in this state.
 
     The learned prior leaves the scale of z free, so that a fixed map may reach far outside the skills that exist; what
     the decoder does there is arbitrary, and an actor that saturates gets stuck. This map cannot leave them. (SPiRL,
@@ -87,20 +87,20 @@ class PriorMap:
         self._half_side = half_side
 
     def to_latent(self, action: jax.Array, prior: Prior) -> jax.Array:
-        """z = mean + c std u."""
+        """Return z = mean + c std u."""
         return prior.mean + self._half_side * jnp.exp(prior.log_std) * action
 
     def to_action(self, latent: jax.Array, prior: Prior) -> jax.Array:
-        """u = (z - mean) / (c std)."""
+        """Return u = (z - mean) / (c std)."""
         return _inside((latent - prior.mean) * jnp.exp(-prior.log_std) / self._half_side)
 
     def log_jacobian(self, action: jax.Array, prior: Prior) -> jax.Array:
-        """d log c + sum log std."""
+        """Return d log c + sum log std."""
         return jnp.sum(jnp.log(self._half_side) + prior.log_std, axis=-1)
 
 
 def latent_map(name: str, half_side: jax.Array | float) -> LatentMap:
-    """The map called "arctanh", "box" or "prior"."""
+    """Return the map called "arctanh", "box" or "prior"."""
     if name == "arctanh":
         return ArctanhMap()
     return BoxMap(half_side) if name == "box" else PriorMap(half_side)

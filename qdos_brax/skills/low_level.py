@@ -21,7 +21,8 @@ Box = jax.Array | float  # half the side of the box of latents, ``skills.latent_
 
 
 class LowLevelPolicy(Protocol):
-    """A source of low-level behaviour. Observations are normalised; leading axes are free but for ``posterior``.
+    """Define a low-level policy: what the high level's action does. Observations are normalised; leading axes are free
+    but for ``posterior``.
 
     Attributes:
         width: of u and z.
@@ -30,7 +31,7 @@ class LowLevelPolicy(Protocol):
     width: int
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
-        """q(z | segment), [B, width] each; log_std is -inf where z is known exactly.
+        """Return q(z | segment), [B, width] each; log_std is -inf where z is known exactly.
 
         Args:
             params: of the source.
@@ -40,15 +41,15 @@ class LowLevelPolicy(Protocol):
         ...
 
     def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """z[..., width] that u[..., width] plays, begun at observation[..., obs]."""
+        """Return z[..., width] that u[..., width] plays, begun at observation[..., obs]."""
         ...
 
     def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """u[..., width] that plays z, inside the box."""
+        """Return u[..., width] that plays z, inside the box."""
         ...
 
     def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """A random u[..., width], for the first steps online."""
+        """Return a random u[..., width], for the first steps online."""
         ...
 
     def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
@@ -56,26 +57,26 @@ class LowLevelPolicy(Protocol):
         ...
 
     def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The action[..., act] of z, in [-1, 1]."""
+        """Return the action[..., act] of z, in [-1, 1]."""
         ...
 
 
 class LatentModel(Protocol):
-    """Prior and decoder of a latent-variable model of behaviour."""
+    """Define a latent-variable model of behaviour: its prior and its decoder."""
 
     latent_dim: int
 
     def prior(self, params: Any, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """p(z | s): (mean[..., z], log standard deviation[..., z])."""
+        """Return p(z | s): (mean[..., z], log standard deviation[..., z])."""
         ...
 
     def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The action[..., act] of z, in [-1, 1]."""
+        """Return the action[..., act] of z, in [-1, 1]."""
         ...
 
 
 class LatentSkills:
-    """A latent-variable model with a state prior, all but its posterior.
+    """Play the latents of a model with a state prior; subclasses add the posterior.
 
     Args:
         model: the model.
@@ -87,27 +88,27 @@ class LatentSkills:
         self._model, self._map_name = model, map_name
 
     def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """By the map."""
+        """Return z[..., width] of u[..., width] by the latent map."""
         return latent_map(self._map_name, box).to_latent(action, self._prior(params, observation))
 
     def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """By the map."""
+        """Return u[..., width] of z[..., width] by the latent map."""
         return latent_map(self._map_name, box).to_action(latent, self._prior(params, observation))
 
     def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """z ~ p(z | s) (SUPE)."""
+        """Return u of a sample z ~ p(z | s) (SUPE)."""
         prior = self._prior(params, observation)
         return latent_map(self._map_name, box).to_action(gaussian_sample(key, *prior), prior)
 
     def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """log p(z(u) | s) + log |dz / du|."""
+        """Return log p(z(u) | s) + log |dz / du|."""
         prior = self._prior(params, observation)
         mapping = latent_map(self._map_name, box)
         latent = mapping.to_latent(action, prior)
         return gaussian_log_prob(latent, *prior) + mapping.log_jacobian(action, prior)
 
     def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The decoder's mean."""
+        """Return the decoder's mean action."""
         return self._model.act(params, observation, latent)
 
     def _prior(self, params: Any, observation: jax.Array) -> Prior:
@@ -115,7 +116,7 @@ class LatentSkills:
 
 
 class TrajectorySkills(LatentSkills):
-    """The trajectory VAE: z says what a whole segment does.
+    """Play the latents of the trajectory VAE: z says what a whole segment does.
 
     Args:
         model: posterior, prior and decoder.
@@ -127,12 +128,12 @@ class TrajectorySkills(LatentSkills):
         self._encode = model.encode
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
-        """The encoder's."""
+        """Return the encoder's posterior."""
         return self._encode(params, segments)
 
 
 class TransitionSkills(LatentSkills):
-    """A latent that is read off single transitions (DiveOff): a segment's is the mean over its own.
+    """Play latents that are read off single transitions (DiveOff): a segment's is the mean over its own.
 
     Args:
         model: prior and decoder.
@@ -150,14 +151,14 @@ class TransitionSkills(LatentSkills):
         self._encode = encode
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
-        """That of the mean of independent latents."""
+        """Return the posterior of the mean of the transitions' independent latents."""
         mean, log_std = self._encode(params, *segments)
         variance = jnp.mean(jnp.exp(2 * log_std), axis=1) / log_std.shape[1]
         return Posterior(jnp.mean(mean, axis=1), 0.5 * jnp.log(variance))
 
 
 class DirectionSkills:
-    """Directions of travel in a representation of states: z is a unit vector, and so is every u's (HILP).
+    """Play directions of travel in a representation of states: z is a unit vector, and so is every u's (HILP).
 
     Args:
         width: of the representation.
@@ -175,34 +176,34 @@ class DirectionSkills:
         self._direction, self._act = direction, act
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
-        """The direction from the segment's first state to the one behind its last."""
+        """Return the direction from the segment's first state to the one behind its last."""
         latent = self._direction(params, segments.observations[:, 0], after)
         return Posterior(latent, jnp.full_like(latent, -jnp.inf))
 
     def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """z = u / ||u||."""
+        """Return z = u / ||u||."""
         return unit_vector(action)
 
     def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """u = z: of all that point there, the one that a unit vector is."""
+        """Return u = z: of all u that point in the direction, the one of length 1."""
         return jnp.clip(latent, -1 + MARGIN, 1 - MARGIN)
 
     def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """Uniform over the directions."""
+        """Return a direction, uniform over the sphere."""
         latent = unit_vector(jax.random.normal(key, (*observation.shape[:-1], self.width)))
         return self.to_action(params, latent, observation, box)
 
     def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """That of the uniform distribution over u."""
+        """Return the log density of the uniform distribution over u."""
         return jnp.full(action.shape[:-1], -self.width * jnp.log(2.0))
 
     def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The directional policy's."""
+        """Return the directional policy's action."""
         return self._act(params, observation, latent)
 
 
 class PrimitiveActions:
-    """No skills: u is the action itself, and a segment is one step (RLPD, ExPLORe).
+    """Play no skills: u is the action itself, and a segment is one step (RLPD, ExPLORe).
 
     Args:
         action_dim: width of actions.
@@ -212,26 +213,26 @@ class PrimitiveActions:
         self.width = action_dim
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
-        """The segment's own action."""
+        """Return the segment's own action."""
         action = segments.actions[:, 0]
         return Posterior(action, jnp.full_like(action, -jnp.inf))
 
     def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """z = u."""
+        """Return z = u."""
         return action
 
     def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """u = z, where the actor's density is finite."""
+        """Return u = z, where the actor's density is finite."""
         return jnp.clip(latent, -1 + MARGIN, 1 - MARGIN)
 
     def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """Uniform over the actions."""
+        """Return an action, uniform over the box."""
         return jax.random.uniform(key, (*observation.shape[:-1], self.width), minval=-1.0)
 
     def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """That of the uniform distribution."""
+        """Return the log density of the uniform distribution."""
         return jnp.full(action.shape[:-1], -self.width * jnp.log(2.0))
 
     def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """z itself."""
+        """Return z itself."""
         return latent

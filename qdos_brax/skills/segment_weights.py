@@ -18,7 +18,7 @@ from qdos_brax.skills.weights import scaled_advantage
 
 
 class SegmentBatch(NamedTuple):
-    """Segments to judge.
+    """Hold segments to judge.
 
     Attributes:
         segment: int32[B], into the list of all segments.
@@ -32,47 +32,47 @@ class SegmentBatch(NamedTuple):
 
 
 class SegmentWeights(Protocol):
-    """A source of advantages. ``artifacts`` is the value phase's: "advantage", scaled, of all segments."""
+    """Define where advantages come from. ``artifacts`` is the value phase's: "advantage", scaled, of all segments."""
 
     def init(self, key: jax.Array) -> Any:
-        """What it carries between gradient steps."""
+        """Return what is carried between gradient steps."""
         ...
 
     def learn(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any], hyper: dict[str, Any]) -> Any:
-        """One gradient step, if it learns."""
+        """Make one gradient step, if there is something to learn; return the new state."""
         ...
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
-        """Advantages[B], scaled (``scaled_advantage``)."""
+        """Return advantages[B], scaled (``scaled_advantage``)."""
         ...
 
 
 class UniformWeights:
-    """All segments count the same (SUPE, OPAL)."""
+    """Weight all segments the same (SUPE, OPAL)."""
 
     def init(self, key: jax.Array) -> dict[str, Any]:
-        """Carries nothing."""
+        """Return nothing to carry."""
         return {}
 
     def learn(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any], hyper: dict[str, Any]) -> Any:
-        """Learns nothing."""
+        """Return ``state`` as it is."""
         return state
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
-        """Advantage 0."""
+        """Return advantage 0 for every segment."""
         return jnp.zeros(batch.segment.shape[0])
 
 
 class LoggedWeights(UniformWeights):
-    """Advantages of all segments, computed once from the values ("segment" and "transition")."""
+    """Weight segments by advantages that were computed once from the values ("segment" and "transition")."""
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
-        """Looks them up."""
+        """Look up the segments' advantages."""
         return artifacts["advantage"][batch.segment]
 
 
 class LatentWeights:
-    """Algorithm 1: Q(s_0, z) - V(s_0), learned along with the skills.
+    """Weight segments by Q(s_0, z) - V(s_0), learned along with the skills (Algorithm 1).
 
     Q is V(s_0) + f(s_0, z), and f is regressed on the logged H-step advantages, which is to regress Q on the H-step
     returns: a whole Q would have to be known to a hundredth before its difference from V says anything.
@@ -90,12 +90,12 @@ class LatentWeights:
         self._scale = scale
 
     def init(self, key: jax.Array) -> dict[str, Any]:
-        """Fresh parameters of f's two heads and Adam's state."""
+        """Return fresh parameters of f's two heads and Adam's state."""
         params = self._gain.init(key, jnp.zeros((1, self._width)))
         return {"params": params, "opt_state": ADAM.init(params)}
 
     def learn(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any], hyper: dict[str, Any]) -> Any:
-        """Regresses both heads on the segments' own advantages."""
+        """Regress both heads on the segments' own advantages."""
         target = artifacts["advantage"][batch.segment]
         inputs = self._inputs(batch)
 
@@ -107,11 +107,11 @@ class LatentWeights:
         return {"params": params, "opt_state": opt_state}
 
     def advantage(self, state: Any, batch: SegmentBatch, artifacts: dict[str, Any]) -> jax.Array:
-        """``smaller_head``, scaled over the batch."""
+        """Return ``smaller_head``, scaled over the batch."""
         return scaled_advantage(self.smaller_head(state, batch), self._scale)
 
     def smaller_head(self, state: Any, batch: SegmentBatch) -> jax.Array:
-        """The smaller of the two heads of Q minus V, [B], on the scale of the logged advantages."""
+        """Return the smaller of the two heads of Q minus V, [B], on the scale of the logged advantages."""
         return self._gain.apply(state["params"], self._inputs(batch)).min(axis=0)
 
     def _inputs(self, batch: SegmentBatch) -> jax.Array:

@@ -23,7 +23,7 @@ from qdos_brax.skills.weights import advantage_weights
 
 
 class Information(Protocol):
-    """Where the states of L_info come from."""
+    """Define where the states of L_info come from."""
 
     def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
         """Normalised observations[B, H, obs] along which skill z_i is decoded, from the segments at starts[B]."""
@@ -31,7 +31,7 @@ class Information(Protocol):
 
 
 class Rollout(NamedTuple):
-    """Random skills and where they led: observations[B, H, obs] (normalised), z[B, latent], segment weights[B]."""
+    """Hold random skills and where they led: observations[B, H, obs] (normalised), z[B, latent], segment weights[B]."""
 
     observations: jax.Array
     latent: jax.Array
@@ -39,7 +39,7 @@ class Rollout(NamedTuple):
 
 
 class SkillPhaseState(struct.PyTreeNode):
-    """What the phase carries, every leaf [members, ...].
+    """Hold what the phase carries, every leaf [members, ...].
 
     Attributes:
         key: typed key.
@@ -61,7 +61,7 @@ class SkillPhaseState(struct.PyTreeNode):
 
 
 class SkillPhase(MemberPhase):
-    """The skill learner.
+    """Learn skills by the weighted trajectory VAE and the mutual-information term.
 
     A block of ``mi_every`` gradient steps shares one batch of rollouts of random skills (none when ``information`` is
     None): simulating is far dearer than a gradient step.

@@ -18,7 +18,8 @@ _SMALLEST_CHANGE = 1e-4  # 1 - autocorrelation: what never changes within an epi
 def slow_features(
     observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, lag: int, slowness: float
 ) -> np.ndarray:
-    """The features whose autocorrelation over ``lag`` steps is at least ``slowness``; the slowest one in any case.
+    """Return the features whose autocorrelation over ``lag`` steps is at least ``slowness``; the slowest one in
+    any case.
 
     Args:
         observations: float[N, obs], normalised per column.

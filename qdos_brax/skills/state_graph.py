@@ -26,7 +26,7 @@ _LEAST_COST = 1e-6  # scipy takes an edge of weight 0 for none
 
 
 def step_costs(rewards: np.ndarray) -> np.ndarray:
-    """float64[N], the highest reward of the data minus the row's; all 1 where rewards are the same everywhere.
+    """Return float64[N], the highest reward of the data minus the row's; all 1 where rewards are the same everywhere.
 
     For rewards of -1 until success this is 1 per step and 0 in success.
     """
@@ -44,7 +44,7 @@ def costs_to_go(
     neighbours: int,
     jump_cost: float,
 ) -> np.ndarray:
-    """The least summed cost with which a row of cost 0 can be reached, from every row.
+    """Return the least summed cost with which a row of cost 0 can be reached, from every row.
 
     Args:
         features: float32[N, F]; distances in them, times ``jump_cost``, count in steps.

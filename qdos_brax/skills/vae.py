@@ -14,21 +14,21 @@ Params = Any
 
 
 class Segments(NamedTuple):
-    """Windows of the data: observations[B, H, obs] (normalised), actions[B, H, act]."""
+    """Hold windows of the data: observations[B, H, obs] (normalised), actions[B, H, act]."""
 
     observations: jax.Array
     actions: jax.Array
 
 
 class Posterior(NamedTuple):
-    """The diagonal Gaussian q(z | tau): mean[B, z], log standard deviation[B, z]."""
+    """Hold the diagonal Gaussian q(z | tau): mean[B, z], log standard deviation[B, z]."""
 
     mean: jax.Array
     log_std: jax.Array
 
 
 class SkillModel:
-    """Posterior, state prior and decoder.
+    """Combine posterior, state prior and decoder of the trajectory VAE.
 
     Args:
         observation_dim: width of observations.
@@ -43,7 +43,7 @@ class SkillModel:
         self._decoder = DiagonalGaussian(config.decoder_hidden, action_dim)
 
     def init(self, key: jax.Array) -> dict[str, Params]:
-        """Fresh parameters: {"encoder", "prior", "decoder"}."""
+        """Return fresh parameters: {"encoder", "prior", "decoder"}."""
         encoder_key, prior_key, decoder_key = jax.random.split(key, 3)
         observation, action = jnp.zeros((1, 2, self.observation_dim)), jnp.zeros((1, 2, self.action_dim))
         return {
@@ -53,25 +53,25 @@ class SkillModel:
         }
 
     def encode(self, params: dict[str, Params], segments: Segments) -> Posterior:
-        """q(z | tau)."""
+        """Return q(z | tau)."""
         return Posterior(*self._encoder.apply(params["encoder"], segments.observations, segments.actions))
 
     def prior(self, params: dict[str, Params], observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """p(z | s_0): (mean[..., z], log standard deviation[..., z])."""
+        """Return p(z | s_0): (mean[..., z], log standard deviation[..., z])."""
         return self._prior.apply(params["prior"], observation)
 
     def decode(
         self, params: dict[str, Params], observation: jax.Array, latent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """pi(a | s, z): (mean[..., act], log standard deviation[..., act])."""
+        """Return pi(a | s, z): (mean[..., act], log standard deviation[..., act])."""
         return self._decoder.apply(params["decoder"], jnp.concatenate([observation, latent], axis=-1))
 
     def act(self, params: dict[str, Params], observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """The low-level policy's mean action[..., act], clipped to [-1, 1]."""
+        """Return the low-level policy's mean action[..., act], clipped to [-1, 1]."""
         return jnp.clip(self.decode(params, observation, latent)[0], -1.0, 1.0)
 
     def reconstruction(self, params: dict[str, Params], segments: Segments, latent: jax.Array) -> jax.Array:
-        """sum_t log pi(a_t | s_t, z), [B]."""
+        """Return sum_t log pi(a_t | s_t, z), [B]."""
         horizon = segments.actions.shape[1]
         repeated = jnp.broadcast_to(latent[:, None], (latent.shape[0], horizon, latent.shape[1]))
         mean, log_std = self.decode(params, segments.observations, repeated)
@@ -86,7 +86,7 @@ class SkillModel:
         key: jax.Array,
         kl_weighted: bool,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """mean_i [ w_i or 1 ] beta KL(q || p) - w_i log-likelihood.
+        """Return mean_i [ w_i or 1 ] beta KL(q || p) - w_i log-likelihood.
 
         Args:
             params: the model's parameters.
@@ -107,7 +107,7 @@ class SkillModel:
     def information_loss(
         self, params: dict[str, Params], observations: jax.Array, latent: jax.Array, weight: jax.Array
     ) -> jax.Array:
-        """mean_i w_i ||z_hat_i - z_i||^2, with z_hat the posterior mean of what skill z does (paper, eq. 5).
+        """Return mean_i w_i ||z_hat_i - z_i||^2, with z_hat the posterior mean of what skill z does (paper, eq. 5).
 
         The actions are decoded anew along ``observations[B, H, obs]``, so that the gradient reaches the decoder
         through them although the states carry none (they come from a rollout, or from the log).

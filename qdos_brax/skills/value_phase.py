@@ -23,7 +23,9 @@ LABEL_BATCH = 2048
 
 
 class ValuePhaseState(struct.PyTreeNode):
-    """What the phase carries, every leaf [members, ...]: healthy is False once a number of the values is not finite."""
+    """Hold what the phase carries, every leaf [members, ...]: healthy is False once a number of the values is not
+    finite.
+    """
 
     key: jax.Array
     values: ValueState
@@ -32,7 +34,7 @@ class ValuePhaseState(struct.PyTreeNode):
 
 
 class ValuePhase(MemberPhase):
-    """IQL on the data set.
+    """Learn values by implicit Q-learning, and from them the segments' advantages.
 
     Args:
         config: the run's configuration.
@@ -83,13 +85,13 @@ class ValuePhase(MemberPhase):
         return scaled_advantage(estimate(state.values, data, hyper["values.discount"]), self._skills.advantage_scale)
 
     def segment(self, values: ValueState, data: DeviceData, discount: jax.Array) -> jax.Array:
-        """sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of every window at ``data.starts``, [S]."""
+        """Return sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of every window at ``data.starts``, [S]."""
         value = partial(self._iql.value, values.value)
         before, after = over_rows(value, data.observations), over_rows(value, data.next_observations)
         return segment_advantages(before, after, data, self._skills.horizon, discount)
 
     def transition(self, values: ValueState, data: DeviceData, discount: jax.Array) -> jax.Array:
-        """mean_t [min Q(s_t, a_t) - V(s_t)] of every window at ``data.starts``, [S]."""
+        """Return mean_t [min Q(s_t, a_t) - V(s_t)] of every window at ``data.starts``, [S]."""
 
         def gap(observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
             q = self._iql.q(values.critic, observation, action).min(axis=0)
@@ -102,7 +104,7 @@ class ValuePhase(MemberPhase):
 def segment_advantages(
     value: jax.Array, next_value: jax.Array, data: DeviceData, horizon: int, discount: jax.Array
 ) -> jax.Array:
-    """sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of every window of ``horizon`` rows at ``data.starts``, [S].
+    """Return sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0) of every window of ``horizon`` rows at ``data.starts``, [S].
 
     Args:
         value: [N], V of every row's state.
@@ -117,12 +119,12 @@ def segment_advantages(
 
 
 def over_rows(function: Callable[..., Any], *arrays: jax.Array) -> Any:
-    """``function`` of single rows, over all N rows in batches that fit the cache."""
+    """Return ``function`` of single rows, over all N rows in batches that fit the cache."""
     return jax.lax.map(lambda row: function(*row), arrays, batch_size=min(LABEL_BATCH, arrays[0].shape[0]))
 
 
 def sample_batch(data: DeviceData, key: jax.Array, size: int, n_step: int, discount: jax.Array) -> ValueBatch:
-    """``size`` n-step transitions, uniform over the windows of the data.
+    """Return ``size`` n-step transitions, uniform over the windows of the data.
 
     ``n_step`` must not exceed the horizon for which ``data.starts`` were made.
     """

@@ -19,7 +19,7 @@ from qdos_brax.nn.optim import ADAM, Params, adam_step, polyak
 
 
 class ValueBatch(NamedTuple):
-    """n-step transitions, leading axis B: discount is gamma^n, or 0 where the way ended."""
+    """Hold n-step transitions, leading axis B: discount is gamma^n, or 0 where the way ended."""
 
     observation: jax.Array
     action: jax.Array
@@ -29,7 +29,7 @@ class ValueBatch(NamedTuple):
 
 
 class ValueHyper(struct.PyTreeNode):
-    """Numbers a scan may vary."""
+    """Hold numbers a scan may vary."""
 
     learning_rate: jax.Array | float
     expectile: jax.Array | float
@@ -37,7 +37,7 @@ class ValueHyper(struct.PyTreeNode):
 
 
 class ValueState(struct.PyTreeNode):
-    """Parameters of V, of the two heads of Q and of their target, and Adam's state."""
+    """Hold parameters of V, of the two heads of Q and of their target, and Adam's state."""
 
     value: Params
     critic: Params
@@ -47,12 +47,12 @@ class ValueState(struct.PyTreeNode):
 
 
 def expectile_loss(error: jax.Array, expectile: jax.Array | float) -> jax.Array:
-    """|expectile - 1(error < 0)| error^2, elementwise (paper, eq. 1; ``error`` = target - prediction)."""
+    """Return |expectile - 1(error < 0)| error^2, elementwise (paper, eq. 1; ``error`` = target - prediction)."""
     return jnp.where(error < 0, 1 - expectile, expectile) * error**2
 
 
 class IQL:
-    """The value learner.
+    """Learn V and Q by implicit Q-learning.
 
     Args:
         observation_dim: width of observations.
@@ -66,27 +66,27 @@ class IQL:
         self._critic = Ensemble(tuple(hidden), size=2)
 
     def init(self, key: jax.Array) -> ValueState:
-        """Fresh parameters; the target starts as a copy."""
+        """Return fresh parameters; the target starts as a copy."""
         value_key, critic_key = jax.random.split(key)
         value = self._value.init(value_key, jnp.zeros((1, self.observation_dim)))
         critic = self._critic.init(critic_key, jnp.zeros((1, self.observation_dim + self.action_dim)))
         return ValueState(value, critic, jax.tree.map(jnp.copy, critic), ADAM.init(value), ADAM.init(critic))
 
     def value(self, params: Params, observation: jax.Array) -> jax.Array:
-        """V(s), [...]."""
+        """Return V(s), [...]."""
         return self._value.apply(params, observation)[..., 0]
 
     def q(self, params: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
-        """Q(s, a) of both heads, [2, ...]."""
+        """Return Q(s, a) of both heads, [2, ...]."""
         return self._critic.apply(params, jnp.concatenate([observation, action], axis=-1))
 
     def value_loss(self, value: Params, target_critic: Params, batch: ValueBatch, expectile: Any) -> jax.Array:
-        """Expectile regression of V to the smaller target head."""
+        """Return the loss of the expectile regression of V to the smaller target head."""
         target = self.q(target_critic, batch.observation, batch.action).min(axis=0)
         return jnp.mean(expectile_loss(target - self.value(value, batch.observation), expectile))
 
     def critic_loss(self, critic: Params, value: Params, batch: ValueBatch) -> jax.Array:
-        """Squared error of both heads to the n-step target."""
+        """Return the squared error of both heads to the n-step target."""
         target = batch.reward + batch.discount * self.value(value, batch.next_observation)
         error = self.q(critic, batch.observation, batch.action) - jax.lax.stop_gradient(target)
         return jnp.mean(jnp.sum(error**2, axis=0))
@@ -94,7 +94,7 @@ class IQL:
     def update(
         self, state: ValueState, batch: ValueBatch, hyper: ValueHyper
     ) -> tuple[ValueState, dict[str, jax.Array]]:
-        """One step of V, of Q and of the target."""
+        """Make one step of V, of Q and of the target."""
         value_loss, grads = jax.value_and_grad(self.value_loss)(
             state.value, state.target_critic, batch, hyper.expectile
         )

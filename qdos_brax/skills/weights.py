@@ -10,17 +10,19 @@ from jax.scipy.special import ndtri
 def segment_advantage(
     macro_reward: jax.Array, discount: jax.Array, value_end: jax.Array, value_start: jax.Array
 ) -> jax.Array:
-    """The H-step estimate sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0), all [B]; ``discount`` is 0 after an end."""
+    """Return the H-step estimate sum_t gamma^t r_t + gamma^H V(s_H) - V(s_0), all [B]; ``discount`` is 0 after an
+    end.
+    """
     return macro_reward + discount * value_end - value_start
 
 
 def transition_advantage(q: jax.Array, value: jax.Array) -> jax.Array:
-    """The paper's text: mean_t [Q(s_t, a_t) - V(s_t)], from q[B, H] and value[B, H]."""
+    """Return the paper's text: mean_t [Q(s_t, a_t) - V(s_t)], from q[B, H] and value[B, H]."""
     return jnp.mean(q - value, axis=-1)
 
 
 def scaled_advantage(advantage: jax.Array, scale: str) -> jax.Array:
-    """Advantages[B] on a scale that does not depend on their unit, about mean square 1.
+    """Return advantages[B] on a scale that does not depend on their unit, about mean square 1.
 
     Args:
         advantage: [B], in units of reward.
@@ -32,7 +34,7 @@ def scaled_advantage(advantage: jax.Array, scale: str) -> jax.Array:
 
 
 def normal_scores(x: jax.Array) -> jax.Array:
-    """The quantile of the standard normal distribution at each x[B]'s mid-rank (van der Waerden; Bliss 1967).
+    """Return the quantile of the standard normal distribution at each x[B]'s mid-rank (van der Waerden; Bliss 1967).
 
     Weights exp(score / lambda) of a large batch then have effective sample share exp(-1 / lambda^2), whatever x's
     distribution; a few outliers cannot take all the weight. Equal x get equal scores, all equal x get 0.
@@ -43,7 +45,7 @@ def normal_scores(x: jax.Array) -> jax.Array:
 
 
 def advantage_weights(advantage: jax.Array, temperature: jax.Array | float, clip: jax.Array | float) -> jax.Array:
-    """exp(A / lambda), normalised over the batch to mean 1, clipped above (paper, eq. 2).
+    """Return exp(A / lambda), normalised over the batch to mean 1, clipped above (paper, eq. 2).
 
     Args:
         advantage: [B], on the scale that lambda is meant for (``scaled_advantage``).
