@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import jax
 import mujoco
 import numpy as np
-from tqdm import tqdm
 
 import qdos_brax
 from envs.task import TaskEnv
@@ -17,6 +15,7 @@ from qdos_brax.collection.experts import policies
 from qdos_brax.data import formats
 from qdos_brax.data.cache import folder, locked
 from qdos_brax.data.quality import QUALITY
+from qdos_brax.runs.progress import Progress
 
 
 def default_dataset(
@@ -64,10 +63,10 @@ def make_file(
     """Collects a set (see ``collect.collect``) with a progress bar; writes it to ``path`` with where it came from."""
     policy = policy or bodies.conduct_of(env).expert()
     collect.check_size(transitions, seed, num_envs)  # before there is a bar
-    with tqdm(total=transitions, unit="steps", unit_scale=True, desc="collect", file=sys.stderr) as bar:
+    with Progress("collect", transitions) as bar:
 
         def report(done: int, total: int) -> None:
-            bar.update(done - bar.n)
+            bar.advance_to(done, "steps")
 
         rows = collect.collect(env, transitions, recipe, seed, num_envs, report, policy)
     counts = np.bincount(rows["infos/quality"], minlength=len(QUALITY))

@@ -109,12 +109,12 @@ def _fetch(args: argparse.Namespace) -> int:
         if sources.find(name) is None:
             raise UserError(f"there is no public data set {name!r}; there are such as {sources.examples()}")
     for name in args.names:
-        print(download.resolve(name))
+        print(download.resolve(name).path)
     return 0
 
 
 def _info(args: argparse.Namespace) -> int:
-    path = download.resolve(args.file)
+    path = download.resolve(args.file).path
     rows, attributes = formats.load(path), formats.read_attrs(path)
     for name, value in attributes.items():
         print(f"{name:18s} {value}")
@@ -152,7 +152,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.horizon < 1:
         raise UserError(f"--horizon must be at least 1, got {args.horizon}")
     env = _env(args.env, "mujoco")
-    path = download.resolve(args.file)
+    path = download.resolve(args.file).path
     rows = formats.load(path)
     found = checks.inspect(rows, env, args.horizon, formats.read_attrs(path))
     for line in found.errors:

@@ -1,8 +1,7 @@
-"""Dataset files in and out: which reader takes a file, the task's labels, and the ``.hdf5`` that is written here."""
+"""Reading and writing dataset files: which reader takes a file, the task's labels, our own ``.hdf5``."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -20,12 +19,13 @@ from qdos_brax.data.readers import d4rl, minari, ogbench
 from qdos_brax.data.readers.rows import Rows, unreadable
 from qdos_brax.data.readers.table import CHECKSUMS, checksum
 from qdos_brax.errors import UserError
+from qdos_brax.files import replacing, user_errors
 
 _CHUNK_BYTES = 1 << 19
 
 
 def read(path: str | os.PathLike[str], env: Any) -> Dataset:
-    """The transitions of ``path``, labelled for the task of ``env``.
+    """Return the transitions of ``path``, labelled for the task of ``env``.
 
     Args:
         path: an OGBench ``.npz``, a D4RL-flat ``.hdf5`` (also ``.h5``), a Minari folder or its ``main_data.hdf5``.
@@ -43,7 +43,7 @@ def read(path: str | os.PathLike[str], env: Any) -> Dataset:
 
 
 def load(path: str | os.PathLike[str]) -> Rows:
-    """The rows of ``path``, not yet checked or labelled; raises UserError when unreadable."""
+    """Return the rows of ``path``, not yet checked or labelled; raise UserError if it is unreadable."""
     path = data_file(path)
     if not _is_hdf5(path):
         return ogbench.load(path)
@@ -53,7 +53,7 @@ def load(path: str | os.PathLike[str]) -> Rows:
 
 
 def data_file(path: str | os.PathLike[str]) -> Path:
-    """The one file that ``path`` stands for: itself, or what holds the episodes of a Minari folder.
+    """Return the one file that ``path`` stands for: itself, or the file that holds the episodes of a Minari folder.
 
     Raises:
         UserError: there is none.
@@ -67,7 +67,7 @@ def data_file(path: str | os.PathLike[str]) -> Path:
 
 
 def write_hdf5(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any]) -> None:
-    """Writes ``arrays`` (keys as in the file, ``infos/qpos`` for a group) whole or not at all, with checksums.
+    """Write ``arrays`` (keys as in the file, ``infos/qpos`` for a group) completely or not at all, with checksums.
 
     Args:
         path: the ``.hdf5`` file; folders are made.
@@ -78,9 +78,9 @@ def write_hdf5(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], a
         UserError: the folder or the disk does not take the file.
     """
     path = Path(path).expanduser()
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with user_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as partial:
         # From version 1.10 of the format on, HDF5 guards its own structures by checksums.
         with h5py.File(partial, "w", libver=("v110", "v110")) as file:
             for key, array in arrays.items():
@@ -90,16 +90,10 @@ def write_hdf5(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], a
             for name, value in attrs.items():
                 file.attrs[name] = value
             file.attrs[CHECKSUMS] = json.dumps({key: checksum(array) for key, array in arrays.items()})
-        os.replace(partial, path)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
 
 
 def read_attrs(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The attributes of an ``.hdf5`` file without the checksums; empty for other files."""
+    """Return the attributes of an ``.hdf5`` file without the checksums; empty for other files."""
     path = data_file(path)
     if not _is_hdf5(path):
         return {}

@@ -194,3 +194,17 @@ def test_elsewhere_it_is_quiet(board: tuple[MemberBoard, MetricsTable]) -> None:
             progress.advance(10.0, "env steps", math.nan)
     (line,) = stream.getvalue().splitlines()
     assert line.startswith("online 100%") and line.endswith("10 env steps/s")
+
+
+def test_amounts_are_shown_with_mean_rate_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 20.0, 20.0, 25.0, 25.0, 4000.0, 4000.0])
+    monkeypatch.setattr("qdos_brax.runs.progress.time.monotonic", lambda: next(clock))
+    stream = io.StringIO()
+    with Progress("collect", 1000, stream=stream) as progress:
+        progress.advance_to(200, "steps")
+        progress.advance_to(300, "steps")  # within ten seconds of the line before
+        progress.advance_to(1000, "steps")
+    assert stream.getvalue().splitlines() == [
+        "collect  20% 00:20<01:20, 10 steps/s",
+        "collect 100% 1:06:40<00:00, 0 steps/s",
+    ]
