@@ -16,7 +16,8 @@ import jax
 
 import envs
 from qdos_brax import config as configs
-from qdos_brax.analysis.finished import TrainedRun, load_run, trained_run
+from qdos_brax.analysis.conclusion import conclude, listed, print_files, read_finished, with_alpha
+from qdos_brax.analysis.finished import trained_run
 from qdos_brax.collection.default_set import default_dataset
 from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
@@ -26,7 +27,7 @@ from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.methods.build import build_phases, plan_members
 from qdos_brax.population.members import Population
-from qdos_brax.report.write import Report, write_report
+from qdos_brax.report.write import write_report
 from qdos_brax.runs import comparison, observers, shares, signals
 from qdos_brax.runs.checkpoint import Artifacts
 from qdos_brax.runs.fingerprints import sha256
@@ -144,7 +145,7 @@ def _compare(path: Path, started: float, chosen: bool) -> None:
             started = time.perf_counter()
         report = write_report([path], path)
     print(f"\n{report.text}\n\ncompared {', '.join(folders)}")
-    _print_files(report)
+    print_files(report)
 
 
 def _continue(folder: RunFolder, started: float, chosen: bool, hosts: Hosts = ALONE) -> None:
@@ -157,7 +158,7 @@ def _continue(folder: RunFolder, started: float, chosen: bool, hosts: Hosts = AL
         summary = folder.read_summary()
         if summary is not None:
             print(f"{folder.path} has finished already")
-            _conclude(folder, summary, lambda: _from_disk(folder))
+            conclude(folder, summary, lambda: read_finished(folder))
             return
         observers.check(config.run)
         _announce(config, config, chosen)
@@ -183,7 +184,7 @@ def _run(config: Config, folder: RunFolder, started: float, hosts: Hosts = ALONE
         return
     data = _load_data(config)
     config, summary, artifacts = _train(config, folder, configs.members(config), data, started)
-    _conclude(folder, summary, lambda: (trained_run(config, data.env, artifacts), data.dataset))
+    conclude(folder, summary, lambda: (trained_run(config, data.env, artifacts), data.dataset))
 
 
 def _run_shares(config: Config, folder: RunFolder, own: list[RunFolder], started: float, hosts: Hosts) -> None:
@@ -204,10 +205,10 @@ def _run_shares(config: Config, folder: RunFolder, own: list[RunFolder], started
     write_text(folder.provenance, own[0].provenance.read_text(encoding="utf-8"))
     summary, artifacts = shares.merge(folder, ended, configs.config_hash(config))
     if data is None:  # this process's share had finished before
-        _conclude(folder, summary, lambda: _from_disk(folder))
+        conclude(folder, summary, lambda: read_finished(folder))
     else:
         env, dataset = data.env, data.dataset
-        _conclude(folder, summary, lambda: (trained_run(config, env, artifacts), dataset))
+        conclude(folder, summary, lambda: (trained_run(config, env, artifacts), dataset))
 
 
 def _load_data(config: Config) -> _Data:
@@ -298,74 +299,12 @@ def _record_origin(folder: RunFolder, data: _Data) -> None:
 def _announce(config: Config, asked: Config, chosen: bool) -> None:
     """Print the first lines: what runs, on which machine, and where."""
     devices = jax.devices()
-    why = (
-        f" (jax sees {'no accelerator' if config.preset == 'cpu' else 'an accelerator'}; choose another with --preset)"
-    )
+    why = f" (jax sees {'no accelerator' if config.preset == 'cpu' else 'an accelerator'}; --preset overrides this)"
     alias = "" if asked.env == config.env else f" (asked for as {asked.env})"
     engine = f"{config.physics}" + (" (auto)" if asked.physics == "auto" else "")
     print(f"task      {config.env}{alias}")
-    print(f"method    {config.method}, {_with_alpha(config.method, config.skills.alpha)}seed {_list(config.seed)}")
+    print(f"method    {config.method}, {with_alpha(config.method, config.skills.alpha)}seed {listed(config.seed)}")
     print(f"preset    {config.preset}{why if chosen else ''}")
     print(f"physics   {engine}")
     print(f"device    {len(devices)} x {devices[0].device_kind}, {len(os.sched_getaffinity(0))} CPU cores")
     print(f"run       {config.out}", flush=True)
-
-
-def _from_disk(folder: RunFolder) -> tuple[TrainedRun, Dataset]:
-    """Read what a finished run learned, and its data."""
-    trained = load_run(folder.path)
-    try:
-        path = Path(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["path"])
-    except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"cannot read from {folder.provenance} which data the run had ({error})") from error
-    return trained, formats.read(path, trained.env)
-
-
-def _conclude(
-    folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[], tuple[TrainedRun, Dataset]]
-) -> None:
-    """Analyse the run, write the report, and print the last lines: results and files.
-
-    Args:
-        folder: the run's folder.
-        summary: its summary.
-        finished: returns what the run learned, and its data; called only if there is no analysis yet.
-    """
-    if not folder.inside.exists():
-        from qdos_brax.analysis.inside import look_inside  # here, because scikit-learn takes its time
-
-        try:
-            look_inside(*finished(), folder.inside)
-        except Exception as error:  # whatever it is: the run is done, and the page does without
-            print(f"inside    left out: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr, flush=True)
-    report = write_report([folder.path], folder.path)
-    minutes = summary["wall_seconds"]["total"] / 60
-    print(f"\ndone in {minutes:.1f} minutes")
-    for member in summary["members"]:
-        success = member["eval_success"]
-        result = "not evaluated" if success is None else f"success {success:.2f} (best {member['best_success']:.2f})"
-        first = member["first_goal_step"]
-        if first is not None:
-            result += f", first goal after {first:,} env steps"
-        elif not member["best_success"]:  # an offline method reaches goals without a step online
-            result += ", no goal reached"
-        state = "" if member["status"] == "ok" else ", FROZEN: its numbers were no longer finite"
-        alpha = _with_alpha(summary["method"], member["alpha"])
-        print(f"  {alpha}seed {member['seed']}: {result}{state}")
-    print(f"summary   {folder.summary}")
-    _print_files(report)
-    print(f"evaluate  python -m qdos_brax evaluate {folder.path}", flush=True)
-
-
-def _print_files(report: Report) -> None:
-    print(f"report    {report.page}")
-    print(f"curves    {report.curves}", flush=True)
-
-
-def _with_alpha(method: str, alpha: Any) -> str:
-    """Return "alpha A, " for methods with the mutual-information term, which it weighs; nothing for the others."""
-    return f"alpha {_list(alpha)}, " if METHODS[method].information else ""
-
-
-def _list(values: Any) -> str:
-    return ", ".join(f"{value:g}" for value in (values if isinstance(values, tuple) else (values,)))

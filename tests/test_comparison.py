@@ -49,13 +49,13 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         kind = DyingPhase if config.out.endswith("killed/supe") and built.count("supe") == 1 else toy.ToyPhase
         return [kind(phase.name, phase.num_chunks) for phase in toy.phases()]
 
-    monkeypatch.setattr(experiment, "_default_data", lambda config, env: data)
+    monkeypatch.setattr(experiment, "_data_file", lambda config, env: (data, None))
     monkeypatch.setattr(experiment.formats, "read", lambda path, env: None)
     monkeypatch.setattr(experiment, "build_phases", phases)
     monkeypatch.setattr(
         experiment, "plan_members", lambda *args: memory.Plan((jax.local_devices()[0],), 1, False, "toys")
     )
-    monkeypatch.setattr(inside, "look_inside", lambda path: None)  # toys have nothing inside
+    monkeypatch.setattr(inside, "look_inside", lambda *args: None)  # toys have nothing inside
     monkeypatch.setattr(experiment.jax, "clear_caches", lambda: None)  # the other tests' programs are theirs
     return built
 
@@ -86,7 +86,7 @@ def test_killed_comparison_goes_on_exactly(
         assert (killed / name).read_text() == (whole / name).read_text()
     capsys.readouterr()
     assert train(f"--resume {whole}") == 0 and built == ["qdos", "supe", "supe"]
-    assert capsys.readouterr().out.count("has ended already") == 2
+    assert capsys.readouterr().out.count("has finished already") == 2
 
 
 def test_alpha_is_not_scanned_where_it_weighs_nothing(tmp_path: Path, built: list[str]) -> None:
@@ -124,14 +124,14 @@ def test_second_process_is_refused(tmp_path: Path, built: list[str], capsys: pyt
     comparison.create(tmp_path / "c", {"qdos": "env: antmaze-medium-task1\n", "supe": "env: antmaze-medium-task1\n"})
     with experiment.RunFolder(tmp_path / "c").held():
         assert train(f"--resume {tmp_path}/c") == 2
-    assert "another process is at work" in capsys.readouterr().err and not built
+    assert "another process works in" in capsys.readouterr().err and not built
 
 
 def test_comparison_is_not_made_twice_nor_read_when_damaged(tmp_path: Path) -> None:
     path = tmp_path / "c"
     comparison.create(path, {"qdos": "env: antmaze-medium-task1\n"})
     assert list(comparison.runs(path)) == ["qdos"]
-    with pytest.raises(UserError, match="holds a comparison already; go on with --resume"):
+    with pytest.raises(UserError, match="holds a comparison already; continue with --resume"):
         comparison.create(path, {"qdos": ""})
     (path / "comparison.json").write_text('{"methods"')
     with pytest.raises(UserError, match="cannot read"):

@@ -131,7 +131,7 @@ def _fetch_from(url: str, path: Path, patience: Patience) -> str:
 
 
 def _continue(url: str, partial: Path, stall: float) -> None:
-    """Complete ``partial`` to the size that the server announces; continue where it is if the server's file is the same."""
+    """Complete ``partial`` to the announced size; continue where it is if the server's file is the same."""
     state_path = partial.with_name(f"{partial.name}.json")
     state = _read_json(state_path)
     done = _size(partial) if state.get("url") == url and state.get("validator") else 0

@@ -80,16 +80,15 @@ def write_hdf5(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], a
     path = Path(path).expanduser()
     with user_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as partial:
-        # From version 1.10 of the format on, HDF5 guards its own structures by checksums.
-        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
-            for key, array in arrays.items():
-                row_bytes = max(1, math.prod(array.shape[1:]) * array.dtype.itemsize)
-                chunk = (max(1, min(len(array), _CHUNK_BYTES // row_bytes)), *array.shape[1:])
-                file.create_dataset(key, data=array, compression="lzf", chunks=chunk)
-            for name, value in attrs.items():
-                file.attrs[name] = value
-            file.attrs[CHECKSUMS] = json.dumps({key: checksum(array) for key, array in arrays.items()})
+    # From version 1.10 of the format on, HDF5 guards its own structures by checksums.
+    with replacing(path) as partial, h5py.File(partial, "w", libver=("v110", "v110")) as file:
+        for key, array in arrays.items():
+            row_bytes = max(1, math.prod(array.shape[1:]) * array.dtype.itemsize)
+            chunk = (max(1, min(len(array), _CHUNK_BYTES // row_bytes)), *array.shape[1:])
+            file.create_dataset(key, data=array, compression="lzf", chunks=chunk)
+        for name, value in attrs.items():
+            file.attrs[name] = value
+        file.attrs[CHECKSUMS] = json.dumps({key: checksum(array) for key, array in arrays.items()})
 
 
 def read_attrs(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -221,7 +221,7 @@ def choose(store: CheckpointStore, attempt: Callable[[str], T], report: Callable
             reasons.append(f"checkpoint {name} cannot be used: {error}")
             continue
         for reason in reasons:
-            report(f"{reason}; going on from {name}")
+            report(f"{reason}; continuing from {name}")
         store.discard_after(name)
         return result
     if reasons:

@@ -1,7 +1,7 @@
 """The loop over phases: chunks, log points, checkpoints. It knows no learner.
 
-A run that is killed and continued ends as it would have ended without the kill: a checkpoint holds everything a chunk reads, the phase's
-constants come again from ``init``, and metrics.csv is cut back to the checkpoint's rows.
+A run that is killed and continued ends as it would have ended without the kill: a checkpoint holds everything a chunk
+reads, the phase's constants come again from ``init``, and metrics.csv is cut back to the checkpoint's rows.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def run_phases(
     table = MetricsTable(folder.metrics, members)
     clock = _Clock(data_seconds, time.perf_counter() if started is None else started)
     keys = _member_keys(members)
-    place = checkpoint.choose(store, lambda name: _restore(name, store, phases, keys, table, clock), signals.say)
+    place = checkpoint.choose(store, lambda name: _restore(name, store, phases, keys, table, clock), signals.warn)
     if place is None:
         table.start()
         place = _Place(0, 0, {}, None)

@@ -33,7 +33,7 @@ def test_a_run_is_not_overwritten(tmp_path: Path) -> None:
     folder = made(tmp_path / "run")
     RunFolder.create(folder.path)  # nothing was trained in it yet
     write_text(folder.metrics, "member,seed\n")
-    with pytest.raises(UserError, match="holds a run already; go on with --resume"):
+    with pytest.raises(UserError, match="holds a run already; continue with --resume"):
         RunFolder.create(tmp_path / "run")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").touch()
@@ -87,4 +87,4 @@ def test_a_signal_outside_the_phases_says_how_to_go_on(
             raise RuntimeError("INTERNAL: callback") from error
     assert stopped.value.code == code and signal.getsignal(number) is before
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == f"stopped; go on with: python train.py --resume {tmp_path}"
+    assert line == f"stopped; continue with: python train.py --resume {tmp_path}"

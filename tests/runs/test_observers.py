@@ -137,7 +137,7 @@ def test_wandb_refusing_is_one_line(tmp_path: Path, server: Any, monkeypatch: py
         raise sys.modules["wandb"].Error("no API key\nconfigured")
 
     monkeypatch.setattr(sys.modules["wandb"], "init", refuse)
-    with pytest.raises(UserError, match=r"does not take the run \(no API key configured\); WANDB_MODE=offline"):
+    with pytest.raises(UserError, match=r"refuses the run \(no API key configured\); set WANDB_MODE=offline"):
         toy.run(tmp_path / "run", observers=[WandbLog(RunFolder(tmp_path / "run"), toy.MEMBERS)])
 
 
