@@ -18,7 +18,7 @@ import pytest
 
 from qdos_brax import experiment
 from qdos_brax.analysis import inside
-from qdos_brax.commands import cli
+from qdos_brax.commands import train as train_command
 from qdos_brax.errors import UserError
 from qdos_brax.population import memory
 from qdos_brax.runs import comparison
@@ -90,7 +90,9 @@ def test_killed_comparison_goes_on_exactly(
 
 
 def test_alpha_is_not_scanned_where_it_weighs_nothing(tmp_path: Path, built: list[str]) -> None:
-    configs = cli.configs_from_args(cli.train_parser().parse_args(shlex.split(f"{command()} --alpha 0.1,0.3")))
+    configs = train_command.configs_from_args(
+        train_command.train_parser().parse_args(shlex.split(f"{command()} --alpha 0.1,0.3"))
+    )
     env = experiment._make_env(configs["qdos"])
     alphas = [experiment._resolved(config, env, tmp_path).skills.alpha for config in configs.values()]
     assert alphas == [(0.1, 0.3), 0.0]
@@ -164,7 +166,7 @@ def command() -> str:
 
 def train(command: str) -> int:
     try:
-        return cli.train_main(shlex.split(command))
+        return train_command.train_main(shlex.split(command))
     except SystemExit as stop:
         return int(stop.code or 0)
 

@@ -12,7 +12,7 @@ import pytest
 
 from qdos_brax import experiment
 from qdos_brax.analysis import conclusion
-from qdos_brax.commands.cli import train_main
+from qdos_brax.commands.train import train_main
 from qdos_brax.data import formats
 
 TINY = (

@@ -33,7 +33,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from qdos_brax.commands.cli import Parser, configs_from_args, positive, train_parser
+from qdos_brax.commands.arguments import Parser, positive
+from qdos_brax.commands.train import configs_from_args, train_parser
 from qdos_brax.config.scan import distribution
 from qdos_brax.errors import UserError
 from qdos_brax.files import user_errors, write_text

@@ -17,7 +17,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from qdos_brax.commands.cli import main, train_main
+from qdos_brax.commands.main import main
+from qdos_brax.commands.train import train_main
 from qdos_brax.data import download, sources
 from qdos_brax.data.sources import Source
 from qdos_brax.errors import UserError

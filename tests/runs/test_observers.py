@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-from qdos_brax.commands import cli
+from qdos_brax.commands import train as train_command
 from qdos_brax.errors import UserError
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.live import MemberBoard
@@ -146,7 +146,7 @@ def test_wandb_that_is_not_installed_is_one_line_and_nothing_starts(
 ) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     flags = ["--env", "antmaze-medium", "--preset", "smoke", "--wandb", "--out", str(tmp_path / "run")]
-    assert cli.train_main(flags) == 2
+    assert train_command.train_main(flags) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: wandb is not installed") and not (tmp_path / "run").exists()
 
