@@ -90,9 +90,8 @@ def test_killed_comparison_goes_on_exactly(
 
 
 def test_alpha_is_not_scanned_where_it_weighs_nothing(tmp_path: Path, built: list[str]) -> None:
-    configs = train_command.configs_from_args(
-        train_command.train_parser().parse_args(shlex.split(f"{command()} --alpha 0.1,0.3"))
-    )
+    flags = shlex.split(f"{command()} --alpha 0.1,0.3")
+    configs = train_command.configs_from_args(train_command.train_parser().parse_args(flags))
     env = experiment._make_env(configs["qdos"])
     alphas = [experiment._resolved(config, env, tmp_path).skills.alpha for config in configs.values()]
     assert alphas == [(0.1, 0.3), 0.0]

@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def main_parser(argv: Sequence[str]) -> Parser:
     """Return the parser of ``python -m qdos_brax``; the actions of ``data`` only if ``argv`` asks for them."""
     parser = Parser(
-        prog="python -m qdos_brax", description="Data, evaluation, reports, pictures, and a check of this machine."
+        prog="python -m qdos_brax", description="Data, evaluation, reports, pictures, a check of this machine."
     )
     parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
@@ -50,7 +50,7 @@ def main_parser(argv: Sequence[str]) -> Parser:
     report.add_argument(
         "--reference",
         metavar="METHOD",
-        help="the method that the others are compared with (default supe, else the first)",
+        help="the method to compare the others with (default supe, else the first)",
     )
     report.set_defaults(run=_report)
 

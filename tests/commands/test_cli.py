@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,14 @@ def test_every_flag_of_the_contract_has_help(capsys: pytest.CaptureFixture[str])
         assert f"{flag} " in text
     for action in train_parser()._actions:
         assert action.help
+
+
+@pytest.mark.parametrize("call", ["train.train_parser()", "main.main_parser([])"])
+def test_help_waits_for_no_jax(call: str) -> None:
+    """It must answer at once; importing jax takes seconds."""
+    module = f"qdos_brax.commands.{call.split('.')[0]}"
+    code = f"import sys, {module}; qdos_brax.commands.{call}.format_help(); sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize(
