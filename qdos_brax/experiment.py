@@ -253,7 +253,7 @@ def _train(
 def _make_env(config: Config) -> Any:
     try:
         return envs.make(config.env, physics=config.physics)
-    except ValueError as error:  # envs knows nothing of UserError; its lines are made for the user all the same
+    except ValueError as error:  # envs does not know UserError; its messages are written for the user too
         raise UserError(str(error)) from error
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
-from qdos_brax.files import replacing
+from qdos_brax.files import write_arrays
 from qdos_brax.methods.build import make_source
 from qdos_brax.skills.vae import Segments
 from qdos_brax.skills.weights import advantage_weights
@@ -76,10 +75,7 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
     for member in members:
         found = _weights(trained, member, sample) | latents.of(member) | _episode(trained, runner, member)
         arrays |= {f"{member}/{name}": array for name, array in found.items()}
-    content = io.BytesIO()
-    np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
-    with replacing(out) as partial:
-        partial.write_bytes(content.getvalue())
+    write_arrays(out, arrays)
 
 
 class _Sample(NamedTuple):

@@ -137,21 +137,21 @@ def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:
 
 
 def _train(args: argparse.Namespace, started: float) -> int:
-    meeting = ("distributed", "coordinator", "processes", "process_id")
-    given = [name for name, value in vars(args).items() if name not in ("resume", *meeting) and value]
+    connection = ("distributed", "coordinator", "processes", "process_id")
+    given = [name for name, value in vars(args).items() if name not in ("resume", *connection) and value]
     if args.resume is not None and given:
         raise UserError(f"--resume uses the run's own config.yaml; leave out --{given[0].replace('_', '-')}")
     if args.resume is None and args.env is None:
         raise UserError("give a task with --env (python -m qdos_brax tasks lists them), or a run to --resume")
 
     if not args.distributed:
-        for name in meeting:
+        for name in connection:
             if getattr(args, name) is not None and name != "distributed":
                 raise UserError(f"--{name.replace('_', '-')} is for a run of several processes; give --distributed too")
     elif args.resume is None and args.out is None:
-        raise UserError("--distributed needs a folder that all processes know; give --out or --resume")
+        raise UserError("--distributed needs a folder that all processes share; give --out or --resume")
 
-    from qdos_brax import experiment  # here, so that --help and a wrong flag answer at once
+    from qdos_brax import experiment  # here, so that --help and a wrong flag answer without importing jax
     from qdos_brax.runs.hosts import ALONE, join
 
     hosts = ALONE

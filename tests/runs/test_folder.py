@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import write_text
+from qdos_brax.files import is_partial, replacing_folder, write_text
 from qdos_brax.runs import signals
 from qdos_brax.runs.folder import RunFolder, new_path
 
@@ -60,6 +60,19 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(UserError, match="No space left on device; free some space"):
         write_text(target, "new")
     assert target.read_text() == "old"
+
+
+def test_a_folder_is_replaced_when_it_is_complete_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "made"
+    for word in ("first", "second"):
+        with replacing_folder(path) as partial:
+            assert is_partial(partial) and partial.parent == tmp_path
+            (partial / word).touch()
+        assert [file.name for file in path.iterdir()] == [word]
+    with pytest.raises(UserError, match="No space left on device; free some space"), replacing_folder(path) as partial:
+        (partial / "third").touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert list(tmp_path.iterdir()) == [path] and [file.name for file in path.iterdir()] == ["second"]
 
 
 def test_new_path_never_repeats(tmp_path: Path) -> None:
