@@ -82,27 +82,31 @@ def start(
     if hosts.count > 1 and len(asked) > 1:
         raise UserError("--distributed shares the members of one run; give one method and one value of each size")
     if len(asked) == 1:
-        resolved = _resolved(first, env, Path(first.out or _new_path(first, env, first.method)))
-        count = len(configs.members(resolved))
-        if count < hosts.count:
-            raise UserError(f"--distributed: {hosts.count} processes cannot share {count} members; use fewer")
-        if hosts.index:
-            folder = shares.await_creation(Path(str(resolved.out)))
-            _run(configs.from_yaml(folder.config), folder, started, hosts)
-            return
-        folder = RunFolder.create(str(resolved.out))
-        with folder.held(), signals.stops_at_once(folder.path):
-            folder.provenance.unlink(missing_ok=True)  # of an attempt in the same folder that ended before training
-            write_text(folder.config, configs.to_yaml(resolved))
-            if hosts.count > 1:
-                shares.create(folder, hosts.count, configs.to_yaml(resolved))
-            _announce(resolved, first, chosen=not preset_given)
-            _run(resolved, folder, started, hosts)
+        _start_run(first, env, started, hosts, chosen=not preset_given)
         return
     path = Path(first.out or _new_path(first, env, "comparison"))
     runs = {name: _resolved(config, _make_env(config), path / name) for name, config in asked.items()}
     comparison.create(path, {name: configs.to_yaml(config) for name, config in runs.items()})
     _compare(path, started, chosen=not preset_given)
+
+
+def _start_run(asked: Config, env: Any, started: float, hosts: Hosts, chosen: bool) -> None:
+    config = _resolved(asked, env, Path(asked.out or _new_path(asked, env, asked.method)))
+    count = len(configs.members(config))
+    if count < hosts.count:
+        raise UserError(f"--distributed: {hosts.count} processes cannot share {count} members; use fewer")
+    if hosts.index:
+        folder = shares.await_creation(Path(str(config.out)))
+        _run(configs.from_yaml(folder.config), folder, started, hosts)
+        return
+    folder = RunFolder.create(str(config.out))
+    with folder.held(), signals.stops_at_once(folder.path):
+        folder.provenance.unlink(missing_ok=True)  # of an attempt in the same folder that ended before training
+        write_text(folder.config, configs.to_yaml(config))
+        if hosts.count > 1:
+            shares.create(folder, hosts.count, configs.to_yaml(config))
+        _announce(config, asked, chosen)
+        _run(config, folder, started, hosts)
 
 
 def resume(path: str, started: float, hosts: Hosts = ALONE) -> None:
@@ -212,8 +216,8 @@ def _run_shares(config: Config, folder: RunFolder, own: list[RunFolder], started
 
 
 def _load_data(config: Config) -> _Data:
-    before = time.perf_counter()
     env = _make_env(config)
+    before = time.perf_counter()
     path, digest = _data_file(config, env)
     print(f"data      {path}", flush=True)
     dataset = formats.read(path, env)
