@@ -1,8 +1,8 @@
-"""``python -m qdos_brax``: data, evaluate, report, tasks, doctor."""
+"""``python -m qdos_brax``: see ``python -m qdos_brax --help``."""
 
 import sys
 
-from qdos_brax.commands.cli import main
+from qdos_brax.commands.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,11 +1,11 @@
-"""The one exception that is a user's to mend."""
+"""The one exception whose cause the user can fix."""
 
 from __future__ import annotations
 
 
 class UserError(Exception):
-    """Bad input: a file, a flag, a shape, a value.
+    """Report bad input: a file, a flag, a shape, a value.
 
-    The message is one line that names the cause and the mend. The command line prints it and exits with code 2;
+    The message is one line that names the cause and the fix. The command line prints it and exits with code 2;
     a library caller may catch it.
     """

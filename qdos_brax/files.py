@@ -1,10 +1,11 @@
-"""Writing files so that they are never half there, and one clear line for what the file system refuses."""
+"""Atomic writing of files and folders, and one clear line for what the file system refuses."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +17,11 @@ _PARTIAL = ".partial"
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replaces ``path`` by ``text`` at once: a reader, or a run that goes on after a kill, sees the old or the new."""
+    """Replace ``path`` by ``text`` at once: a reader, or a run that continues after a kill, sees the old or the new.
+
+    Raises:
+        UserError: the file system refuses; ``path`` is as it was.
+    """
     with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         file.write(text)
         file.flush()
@@ -35,7 +40,11 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file of the same ending to write to, which takes ``path``'s place at the end; nothing changes on an error."""
+    """Yield a file name of the same ending to write to; rename it to ``path`` at the end, or remove it on an error.
+
+    Raises:
+        UserError: the file system refuses; ``path`` is as it was.
+    """
     partial = path.with_name(f".{path.stem}{_PARTIAL}{path.suffix}")
     with user_errors(path):
         try:
@@ -46,14 +55,36 @@ def replacing(path: Path) -> Iterator[Path]:
                 partial.unlink()
 
 
+@contextlib.contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Yield a new folder to fill; rename it to ``path`` at the end, or remove it on an error.
+
+    A folder that is at ``path`` already is replaced with everything in it.
+
+    Raises:
+        UserError: the file system refuses.
+    """
+    partial = path.with_name(f".{path.name}{_PARTIAL}")
+    with user_errors(path):
+        try:
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True)
+            yield partial
+            if path.exists():
+                shutil.rmtree(path)
+            os.replace(partial, path)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
 def is_partial(path: Path) -> bool:
-    """Whether it is a file that a kill left half written."""
+    """Return whether the name is that of a file or folder that a kill left incomplete."""
     return path.name.startswith(".") and _PARTIAL in path.name
 
 
 @contextlib.contextmanager
 def user_errors(path: Path) -> Iterator[None]:
-    """Turns what the file system refuses into one clear line."""
+    """Turn what the file system refuses into a UserError of one clear line."""
     try:
         yield
     except OSError as error:
@@ -61,15 +92,15 @@ def user_errors(path: Path) -> Iterator[None]:
 
 
 def refusal(path: Path, error: OSError) -> str:
-    """The line for an OSError: what could not be written, why, and what helps."""
-    mends = {
-        errno.ENOSPC: "free some space and go on with --resume",
-        errno.EDQUOT: "free some space and go on with --resume",
+    """Return the line for an OSError: which file could not be written, why, and what helps."""
+    remedies = {
+        errno.ENOSPC: "free some space and continue with --resume",
+        errno.EDQUOT: "free some space and continue with --resume",
         errno.EROFS: "choose a folder that can be written, with --out",
         errno.EACCES: "choose a folder that can be written, with --out",
         errno.EPERM: "choose a folder that can be written, with --out",
         errno.ENOTDIR: "choose another folder with --out",
         errno.EEXIST: "choose another folder with --out",
     }
-    mend = mends.get(error.errno or 0)
-    return f"cannot write {path}: {error.strerror or error}" + (f"; {mend}" if mend else "")
+    remedy = remedies.get(error.errno or 0)
+    return f"cannot write {path}: {error.strerror or error}" + (f"; {remedy}" if remedy else "")

@@ -19,7 +19,7 @@ import pytest
 
 from qdos_brax import experiment
 from qdos_brax.analysis import inside
-from qdos_brax.commands import cli
+from qdos_brax.commands import train as train_command
 from qdos_brax.errors import UserError
 from qdos_brax.population import memory
 from qdos_brax.runs import comparison
@@ -51,7 +51,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         kind = DyingPhase if config.out.endswith("killed/supe") and built.count("supe") == 1 else toy.ToyPhase
         return [kind(phase.name, phase.num_chunks) for phase in toy.phases()]
 
-    monkeypatch.setattr(experiment, "_default_data", lambda config, env: data)
+    monkeypatch.setattr(experiment, "_data_file", lambda config, env: (data, None))
     monkeypatch.setattr(experiment.formats, "read", lambda path, env: None)
     context = lambda config, env, dataset: SimpleNamespace(config=config, data=None)  # noqa: E731
     monkeypatch.setattr(experiment, "build_context", context)
@@ -60,7 +60,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(
         experiment, "plan_members", lambda *args: memory.MemoryPlan((jax.local_devices()[0],), 1, False, "toys")
     )
-    monkeypatch.setattr(inside, "look_inside", lambda path: None)  # toys have nothing inside
+    monkeypatch.setattr(inside, "look_inside", lambda *args: None)  # toys have nothing inside
     monkeypatch.setattr(experiment.jax, "clear_caches", lambda: None)  # the other tests' programs are theirs
     return built
 
@@ -91,11 +91,12 @@ def test_killed_comparison_goes_on_exactly(
         assert (killed / name).read_text() == (whole / name).read_text()
     capsys.readouterr()
     assert train(f"--resume {whole}") == 0 and built == ["qdos", "supe", "supe"]
-    assert capsys.readouterr().out.count("has ended already") == 2
+    assert capsys.readouterr().out.count("has finished already") == 2
 
 
 def test_alpha_is_not_scanned_where_it_weighs_nothing(tmp_path: Path, built: list[str]) -> None:
-    configs = cli.configs_from_args(cli.train_parser().parse_args(shlex.split(f"{command()} --alpha 0.1,0.3")))
+    flags = shlex.split(f"{command()} --alpha 0.1,0.3")
+    configs = train_command.configs_from_args(train_command.train_parser().parse_args(flags))
     env = experiment._make_env(configs["qdos"])
     alphas = [experiment._resolved(config, env, tmp_path).skills.alpha for config in configs.values()]
     assert alphas == [(0.1, 0.3), 0.0]
@@ -129,14 +130,14 @@ def test_second_process_is_refused(tmp_path: Path, built: list[str], capsys: pyt
     comparison.create(tmp_path / "c", {"qdos": "env: antmaze-medium-task1\n", "supe": "env: antmaze-medium-task1\n"})
     with experiment.RunFolder(tmp_path / "c").held():
         assert train(f"--resume {tmp_path}/c") == 2
-    assert "another process is at work" in capsys.readouterr().err and not built
+    assert "another process works in" in capsys.readouterr().err and not built
 
 
 def test_comparison_is_not_made_twice_nor_read_when_damaged(tmp_path: Path) -> None:
     path = tmp_path / "c"
     comparison.create(path, {"qdos": "env: antmaze-medium-task1\n"})
     assert list(comparison.runs(path)) == ["qdos"]
-    with pytest.raises(UserError, match="holds a comparison already; go on with --resume"):
+    with pytest.raises(UserError, match="holds a comparison already; continue with --resume"):
         comparison.create(path, {"qdos": ""})
     (path / "comparison.json").write_text('{"methods"')
     with pytest.raises(UserError, match="cannot read"):
@@ -169,7 +170,7 @@ def command() -> str:
 
 def train(command: str) -> int:
     try:
-        return cli.train_main(shlex.split(command))
+        return train_command.train_main(shlex.split(command))
     except SystemExit as stop:
         return int(stop.code or 0)
 

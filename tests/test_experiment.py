@@ -6,10 +6,14 @@ import csv
 import json
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from qdos_brax.commands.cli import train_main
+from qdos_brax import experiment
+from qdos_brax.analysis import conclusion
+from qdos_brax.commands.train import train_main
+from qdos_brax.data import formats
 
 TINY = (
     "--env antmaze-medium --preset smoke --pretrain-steps 2 --steps 160 --set data.transitions=1000 "
@@ -23,15 +27,40 @@ def test_a_scan_of_two_from_flags_to_page(
 ) -> None:
     monkeypatch.setenv("QDOS_DATA", str(tmp_path / "data"))
     run = tmp_path / "run"
+    calls = {name: counted(monkeypatch, module, name) for module, name in ((formats, "read"), (experiment, "sha256"))}
+    monkeypatch.setattr(conclusion, "load_run", refuse)  # what is in memory is not read again
     assert train_main(shlex.split(f"{TINY} --alpha 0.1,0.3 --seed 0,1 --zip --out {run}")) == 0
     said = capsys.readouterr().out
     assert "members   2 members, " in said and "done in" in said
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     assert [(member["seed"], member["alpha"]) for member in summary["members"]] == [(0, 0.1), (1, 0.3)]
+    assert calls == {"read": [1], "sha256": [1]} and (run / "inside.npz").exists()
+    assert f"  alpha 0.3, seed 1: success {summary['members'][1]['eval_success']:.2f} (best " in said
     assert all(member["status"] == "ok" and member["env_steps"] == 160 for member in summary["members"])
     with (run / "metrics.csv").open(newline="") as file:
         phases = {row["phase"] for row in csv.DictReader(file)}
     assert phases == {"values", "skills", "label", "online"}
     assert (run / "report.html").stat().st_size > 0 and any((run / "tensorboard").rglob("events*"))
     assert train_main(["--resume", str(run)]) == 0  # it has ended: said, not done again
-    assert "has ended already" in capsys.readouterr().out
+    assert "has finished already" in capsys.readouterr().out
+
+
+def test_alpha_is_printed_only_where_it_has_an_effect() -> None:
+    assert conclusion.with_alpha("qdos", (0.1, 0.3)) == "alpha 0.1, 0.3, "
+    assert conclusion.with_alpha("bc", 0.0) == ""
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[int]:
+    """Count the calls of a function, in the only entry of the list."""
+    calls, function = [0], getattr(module, name)
+
+    def call(*args: Any) -> Any:
+        calls[0] += 1
+        return function(*args)
+
+    monkeypatch.setattr(module, name, call)
+    return calls
+
+
+def refuse(*args: Any) -> None:
+    raise AssertionError("read from disk")

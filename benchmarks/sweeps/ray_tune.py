@@ -5,16 +5,16 @@
         --set "skills.kl_weight=loguniform(0.02,0.5)" --samples 8 --gpus 1 --stop-early 20000 \
         --env antmaze-large --seed 0,1,2,3
 
-runs 16 trials: of every alpha 8, each with a KL weight of its own. What this script does not know (here --env and
---seed) goes to train.py as it is. Ray starts as many trials at once as the machine, or the cluster that RAY_ADDRESS
-names, has room for; on a cluster this checkout and --out lie on a disk of all nodes. The seeds of a trial train
-together as one program.
+runs 16 trials: 8 for every alpha, each with a KL weight of its own. Flags that this script does not know (here --env
+and --seed) are passed on to train.py. Ray starts as many trials at once as the machine, or the cluster that RAY_ADDRESS
+names, has room for; on a cluster this checkout and --out must be on a disk that all nodes share. The seeds of a trial
+train together as one program.
 
-Ray is told the success of the last evaluation, the mean over the seeds, while a trial runs. With --stop-early it stops
-those that are behind (ASHA). A trial that is stopped gets SIGTERM, saves and ends; so do all on Ctrl-C or SIGTERM. The
-same command again goes on with what has not ended, exactly where it was. (Where a cluster was started by hand, set
-RAY_kill_child_processes_on_worker_exit=0 for ``ray start``: else Ray kills a trial that takes more than 10 seconds to
-save, which costs the work since the last checkpoint, and no more.) When all have ended:
+While a trial runs, it reports the success of the last evaluation, the mean over the seeds, to Ray. With --stop-early
+Ray stops trials that are behind (ASHA). A trial that is stopped gets SIGTERM, saves and ends; so do all on Ctrl-C or
+SIGTERM. The same command again continues unfinished trials exactly where they were. (If you started a cluster by hand,
+set RAY_kill_child_processes_on_worker_exit=0 for ``ray start``: otherwise Ray kills a trial that takes more than 10
+seconds to save, which loses the work since the last checkpoint.) When all have finished:
 
     python -m qdos_brax report runs/sweep/trials/* --out runs/sweep/report
 """
@@ -33,7 +33,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from qdos_brax.commands.cli import Parser, configs_from_args, positive, train_parser
+from qdos_brax.commands.arguments import Parser, positive
+from qdos_brax.commands.train import configs_from_args, train_parser
 from qdos_brax.config.scan import distribution
 from qdos_brax.errors import UserError
 from qdos_brax.files import user_errors, write_text
@@ -42,25 +43,25 @@ from qdos_brax.runs.metrics import read_rows, step_of
 
 TRAIN = Path(__file__).resolve().parents[2] / "train.py"
 _POLL = 0.5
-_HEARTBEAT = 5.0  # seconds until Ray hears of a trial again: while it waits it cannot stop the trial
-_ENDLESS = 10**12  # environment steps; how long a trial is, train.py knows
-_RETRIES = 2  # of a trial whose machine was lost
+_HEARTBEAT = 5.0  # seconds between two reports to Ray, which cannot stop a trial while it waits for one
+_ENDLESS = 10**12  # environment steps; train.py sets the length of a trial
+_RETRIES = 2  # for a trial whose machine was lost
 
 
 class Run:
-    """One ``train.py`` in a folder of its own, which Ray's worker starts, watches and stops.
+    """Start, watch and stop one ``train.py`` in a folder of its own, for Ray's worker.
 
     Args:
-        folder: the run folder; where it holds a run already, that one goes on.
-        flags: for train.py, of a new run.
-        cwd: where relative paths among the flags begin.
+        folder: the run folder; if it holds a run already, that run is continued.
+        flags: flags of train.py for a new run.
+        cwd: folder that relative paths among the flags refer to.
     """
 
     def __init__(self, folder: Path, flags: Sequence[str], cwd: str) -> None:
         self.folder = RunFolder(folder)
-        self.log = folder.with_name(f"{folder.name}.log")  # beside it, since a new run wants an empty folder
+        self.log = folder.with_name(f"{folder.name}.log")  # beside it, since a new run needs an empty folder
         folder.parent.mkdir(parents=True, exist_ok=True)
-        while folder.exists() and self.folder.is_held():  # by the run of a worker that was lost, which goes on alone
+        while folder.exists() and self.folder.is_held():  # by the run of a worker that was lost, which continues alone
             time.sleep(_POLL)
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
@@ -68,7 +69,7 @@ class Run:
             )
 
     def step(self) -> dict[str, Any]:
-        """What is new: waits for an evaluation, the end, or the heartbeat.
+        """Wait for an evaluation, the end, or the heartbeat; return what is new.
 
         Returns:
             "steps" and "success" of the last evaluation (0 and nan before the first), "done".
@@ -81,27 +82,27 @@ class Run:
             time.sleep(_POLL)
         if code:
             lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
-            raise RuntimeError(f"train.py ended with code {code}: {lines[-1] if lines else 'it said nothing'}")
+            raise RuntimeError(f"train.py ended with code {code}: {lines[-1] if lines else 'it printed nothing'}")
         steps, success = score(self.folder)
         return {"steps": steps, "success": success, "done": code == 0}
 
     def stop(self) -> None:
-        """Lets train.py save and end."""
+        """Stop train.py, which saves first."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             self.process.wait()
 
 
 def command(folder: RunFolder, flags: Sequence[str]) -> list[str]:
-    """What a trial runs: a new run in the folder, or the one that it holds."""
+    """Return the command of a trial: a new run in the folder, or the run that it holds."""
     begun = folder.metrics.exists()
     return [sys.executable, str(TRAIN), *(["--resume"] if begun else [*flags, "--out"]), str(folder.path)]
 
 
 def score(folder: RunFolder) -> tuple[int, float]:
-    """(steps, success) of the last evaluation: environment steps, and the mean over the members, 0..1.
+    """Return (steps, success) of the last evaluation: environment steps, and the mean over the members, 0..1.
 
-    Steps are updates where a method learns from the data alone. Before the first evaluation they are (0, nan).
+    Steps are updates if the method learns from the data alone. Before the first evaluation they are (0, nan).
     """
     if not folder.metrics.exists():
         return 0, math.nan
@@ -114,16 +115,16 @@ def score(folder: RunFolder) -> tuple[int, float]:
 
 
 def settings(chosen: Mapping[str, Any]) -> list[str]:
-    """The flags of what Ray chose for a trial; numbers drawn have six digits, as a table shows them."""
+    """Return the flags for the values that Ray chose; numbers have six digits, as in a table."""
     texts = {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in chosen.items()}
     return [part for key, text in texts.items() for part in ("--set", f"{key}={text}")]
 
 
 def searched(assignments: Sequence[str]) -> dict[str, tuple[str, float, float] | list[str]]:
-    """By dotted key what Ray shall choose from: (name, low, high) of a distribution, or a list.
+    """Return what Ray chooses from, by dotted key: (name, low, high) of a distribution, or a list.
 
     Raises:
-        UserError: one is no assignment, or comes twice.
+        UserError: one is no assignment, or a key appears twice.
     """
     found: dict[str, tuple[str, float, float] | list[str]] = {}
     for assignment in assignments:
@@ -137,10 +138,10 @@ def searched(assignments: Sequence[str]) -> dict[str, tuple[str, float, float] |
 
 
 def check(flags: Sequence[str], space: Mapping[str, tuple[str, float, float] | list[str]]) -> None:
-    """Reads the flags and every value as train.py will, before any trial starts.
+    """Read the flags and every value as train.py will, before any trial starts.
 
     Raises:
-        UserError: train.py would refuse them, or the flags name a folder or more than one program.
+        UserError: train.py would refuse them, or the flags name a folder or ask for more than one program.
     """
     parser = train_parser()
     args = parser.parse_args(list(flags))
@@ -149,7 +150,7 @@ def check(flags: Sequence[str], space: Mapping[str, tuple[str, float, float] | l
     for name in ("out", "resume", "distributed"):
         if getattr(args, name):
             raise UserError(f"--{name} is not for a trial: each has a folder and a process of its own")
-    args.preset = args.preset or "cpu"  # the default would be by this machine's devices, and trials may run on others
+    args.preset = args.preset or "cpu"  # the default depends on this machine's devices, and trials may run on others
     given = args.set
     for key, values in space.items():
         for value in values[1:] if isinstance(values, tuple) else values:
@@ -159,7 +160,7 @@ def check(flags: Sequence[str], space: Mapping[str, tuple[str, float, float] | l
 
 
 def main() -> int:
-    """The command line: 0 if all trials ended well."""
+    """Run the command line; return 0 if all trials finished."""
     parser = Parser(prog="ray_tune.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the sweep")
     parser.add_argument(
@@ -190,8 +191,8 @@ def main() -> int:
 def sweep(
     args: argparse.Namespace, flags: Sequence[str], space: Mapping[str, tuple[str, float, float] | list[str]]
 ) -> int:
-    """Runs the trials, or goes on with those that have not ended; the exit code."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
+    """Run the trials, or continue the unfinished ones; return the exit code."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # send nothing to Ray's developers
     os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")  # train.py writes TensorBoard's files and CSVs
     # Ray waits 10 seconds for those it stops at the end; a run whose worker is gone by then still saves.
     os.environ.setdefault("RAY_kill_child_processes_on_worker_exit", "0")
@@ -209,7 +210,7 @@ def sweep(
     signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))  # Tune handles that one
 
     class Trial(tune.Trainable):
-        """A run as Ray sees it."""
+        """Show a run to Ray."""
 
         def setup(self, config: dict[str, Any]) -> None:
             self._run = Run(out / "trials" / self.trial_id, [*flags, *settings(config)], cwd)
@@ -251,7 +252,7 @@ def sweep(
         if result.error:
             how = f"failed: {result.error}"
         elif not metrics.get("done"):
-            how += ", not ended; the same command again goes on"
+            how += ", not finished; run the same command again to continue"
         else:
             ended += 1
         print(f"{metrics.get('trial_id')}: {' '.join(settings(result.config)[1::2])}, {how}")
@@ -260,10 +261,10 @@ def sweep(
 
 
 def same_as_before(path: Path, asked: dict[str, Any]) -> None:
-    """Writes down what the sweep was asked for, or compares it with what was.
+    """Write the sweep's settings to a file, or compare them with those in it.
 
     Raises:
-        UserError: it is another sweep.
+        UserError: the file holds the settings of another sweep.
     """
     if path.exists() and json.loads(path.read_text(encoding="utf-8")) != asked:
         raise UserError(f"{path.parent} holds a sweep of other settings; give those, or choose another --out")

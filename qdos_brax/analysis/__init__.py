@@ -1,1 +1,1 @@
-"""Finished runs: loading, evaluating, filming, and looking inside."""
+"""Finished runs: loading, evaluating, filming, analysing, concluding."""

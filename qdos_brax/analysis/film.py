@@ -1,4 +1,4 @@
-"""A film of what a run has learned."""
+"""Films of episodes that a finished run's agents play."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from qdos_brax.report.video import mp4
 
 
 def film_run(run: Path, out: Path, height: int = 480) -> dict[str, float]:
-    """Films the first episode of the first member of a finished run, in real time.
+    """Film the first episode of the first member of a finished run, in real time.
 
-    It starts where the first episode of ``evaluate_run`` starts. The two may part later: a program for one environment
+    It starts as the first episode of ``evaluate_run`` does. The two may differ later: a program for one environment
     rounds differently from one for many.
 
     Args:
         run: the run folder.
         out: the film, ending in .mp4.
-        height: of its frames, in pixels; the width follows from the maze.
+        height: height of its frames in pixels; the width follows from the maze.
 
     Returns:
         The episode's success (0 or 1), return and length.
 
     Raises:
-        UserError: the run has not ended, this machine cannot draw or film, or the film cannot be written.
+        UserError: the run has not finished, this machine cannot draw or film, or the film cannot be written.
     """
     trained = load_run(run)
     env, episode_return, length = trained.env, 0.0, -1
@@ -38,15 +38,15 @@ def film_run(run: Path, out: Path, height: int = 480) -> dict[str, float]:
     except NoOpenGL as error:
         raise UserError(str(error)) from error
     with renderer, mp4(out, renderer.height, renderer.width, steps_per_second(env)) as write:
-        for state, _ in Player(trained).episode(0):
+        for state, _ in EpisodeRunner(trained).episode(0):
             write(renderer.frame(state.pipeline_state.qpos, state.info["goal"]))
             length += 1
             episode_return += float(state.reward) if length else 0.0
     return {"success": float(state.metrics["success"]), "return": episode_return, "length": length}
 
 
-class Player:
-    """Plays the episodes that evaluation begins with, compiled once for all members of a run.
+class EpisodeRunner:
+    """Run the episodes that evaluation begins with, compiled once for all members of a run.
 
     Args:
         trained: the run.
@@ -59,7 +59,7 @@ class Player:
         self._step = jax.jit(self._step_once)
 
     def episode(self, member: int) -> Iterator[tuple[Any, jax.Array | None]]:
-        """A member's first episode: its start, and then every state with the latent that led to it."""
+        """Yield the states of a member's first episode, each with the latent that led to it (None for the start)."""
         learned = of_member(self._trained, member)
         state = self._reset(jax.random.split(evaluation_key(), 1)[0])
         yield state, None
@@ -76,6 +76,6 @@ class Player:
 
 
 def of_member(trained: TrainedRun, member: int) -> tuple[Any, Any]:
-    """(artifacts, hyper) of one member, which ``trained.agent`` takes."""
+    """Return (artifacts, hyper) of one member, as ``trained.agent`` takes them."""
     artifacts, hyper = jax.tree.map(lambda x: x[member], (trained.artifacts, trained.hyper))
     return artifacts, hyper

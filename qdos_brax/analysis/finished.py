@@ -45,23 +45,34 @@ class TrainedRun(NamedTuple):
 
 
 def load_run(run: Path) -> TrainedRun:
-    """The agents of a finished run.
+    """Read the agents of a finished run from its folder.
 
     Args:
         run: the run folder.
 
     Raises:
-        UserError: it is no run folder, or the run has not ended.
+        UserError: it is no run folder, or the run has not finished.
     """
     folder = RunFolder.open(str(run))
     config = configs.from_yaml(folder.config)
     if folder.read_summary() is None:
-        raise UserError(f"the run in {run} has not ended; go on with: python train.py --resume {run}")
+        raise UserError(f"the run in {run} has not finished; continue it with: python train.py --resume {run}")
     env = envs.make(config.env, physics=config.physics)
+    return trained_run(config, env, final_artifacts(folder.checkpoints, configs.config_hash(config)))
+
+
+def trained_run(config: Config, env: Any, artifacts: Any) -> TrainedRun:
+    """Return the agents of a run.
+
+    Args:
+        config: the run's configuration.
+        env: its task.
+        artifacts: what its phases learned, with a leading member axis; copied to one device from however many.
+    """
     return TrainedRun(
         config,
         env,
-        final_artifacts(folder.checkpoints, configs.config_hash(config)),
+        jax.device_put(artifacts, jax.local_devices()[0]),
         {key: jnp.asarray(value) for key, value in configs.population_hyper(config).items()},
         _policy(config, env),
     )
@@ -100,7 +111,7 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
         One dict per member: seed, alpha, and whatever else varies, success (0..1), return, length, episodes.
 
     Raises:
-        UserError: it is no run folder, or the run has not ended.
+        UserError: it is no run folder, or the run has not finished.
     """
     trained = load_run(run)
     members = configs.members(trained.config)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,16 +14,14 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 import envs
 from envs.render import NoOpenGL, Renderer
 from qdos_brax import config as configs
-from qdos_brax.analysis.film import Player, of_member
-from qdos_brax.analysis.finished import TrainedRun, evaluation_key, load_run
-from qdos_brax.data import formats, quality
+from qdos_brax.analysis.film import EpisodeRunner, of_member
+from qdos_brax.analysis.finished import TrainedRun, evaluation_key
+from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
-from qdos_brax.errors import UserError
 from qdos_brax.files import write_arrays
 from qdos_brax.methods.build import make_low_level
-from qdos_brax.runs.folder import RunFolder
 from qdos_brax.skills.vae import Segments
 from qdos_brax.skills.weights import advantage_weights
 
@@ -41,12 +38,12 @@ _SEED = 0  # of the sample of segments, and of t-SNE
 Arrays = dict[str, np.ndarray]
 
 
-def look_inside(run: Path) -> None:
-    """Write inside.npz into the folder of a finished run.
+def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
+    """Analyse a finished run and write what was found to ``out``.
 
     Arrays that the task, the method or the machine (without OpenGL) cannot give are left out.
 
-    Its arrays, where m is the number of an analysed member:
+    The arrays of ``out``, where m is the number of an analysed member:
         members: int[M], the numbers of the analysed members.
         gain, return, quality: [n], of random segments of the data: the decrease of the shortest path to the goal,
             undiscounted return, index into ``quality_names``.
@@ -62,22 +59,23 @@ def look_inside(run: Path) -> None:
         goal, walls: float[2], float[W, 2], the goal and the centres of the wall cells.
 
     Args:
-        run: the run folder.
+        trained: the run.
+        dataset: its data.
+        out: the file, ending in .npz.
 
     Raises:
-        UserError: the run has not finished, its data are gone, or the file cannot be written.
+        UserError: the file cannot be written.
     """
-    trained = load_run(run)
     # On MuJoCo C whatever the run was on: a few episodes are not worth MJX's compilation.
     trained = trained._replace(env=envs.make(trained.config.env, physics="mujoco"))
-    sample = _sample(RunFolder.open(run), trained)
+    sample = _sample(trained, dataset)
     members = _first_seeds(trained)
     arrays: Arrays = {"members": np.asarray(members), **_place(trained.env), **_truth(trained, sample)}
-    latents, player = _LatentView(trained, sample), Player(trained)
+    latents, runner = _LatentView(trained, sample), EpisodeRunner(trained)
     for member in members:
-        found = _weights(trained, member, sample) | latents.of(member) | _episode(trained, player, member)
+        found = _weights(trained, member, sample) | latents.of(member) | _episode(trained, runner, member)
         arrays |= {f"{member}/{name}": array for name, array in found.items()}
-    write_arrays(RunFolder.open(run).inside, arrays)
+    write_arrays(out, arrays)
 
 
 class _Sample(NamedTuple):
@@ -96,13 +94,8 @@ class _Sample(NamedTuple):
     starts: np.ndarray
 
 
-def _sample(folder: RunFolder, trained: TrainedRun) -> _Sample:
+def _sample(trained: TrainedRun, dataset: Dataset) -> _Sample:
     """Draw random segments, the same ones for every method on the same data."""
-    try:
-        path = Path(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["path"])
-    except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"cannot read from {folder.provenance} which data the run had ({error})") from error
-    dataset = formats.read(path, trained.env)
     data, _ = to_device(dataset, trained.config.skills.horizon)
     total = data.starts.shape[0]
     chosen = np.sort(np.random.default_rng(_SEED).choice(total, min(_SEGMENTS, total), replace=False))
@@ -234,10 +227,10 @@ def _between(latents: np.ndarray) -> np.ndarray:
 # --- An episode ------------------------------------------------------------------------------------------------
 
 
-def _episode(trained: TrainedRun, player: Player, member: int) -> Arrays:
+def _episode(trained: TrainedRun, runner: EpisodeRunner, member: int) -> Arrays:
     states: list[tuple[np.ndarray, ...]] = []
     latents: list[np.ndarray] = []
-    for state, latent in player.episode(member):
+    for state, latent in runner.episode(member):
         if latent is not None and (len(states) - 1) % trained.config.skills.horizon == 0:
             latents.append(np.asarray(latent))
         physics = state.pipeline_state

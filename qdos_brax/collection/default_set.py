@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import jax
 import mujoco
 import numpy as np
-from tqdm import tqdm
 
 import qdos_brax
 from envs.mazes.maze_task import MazeTask
@@ -21,6 +19,7 @@ from qdos_brax.collection.profiles import profile_of
 from qdos_brax.data import formats
 from qdos_brax.data.cache import folder, locked
 from qdos_brax.data.quality import QUALITY
+from qdos_brax.runs.progress import Progress
 
 
 def default_dataset(
@@ -67,10 +66,10 @@ def make_file(path: Path, collector: Collector, transitions: int, seed: int, num
         UserError: an argument is out of range, or the file cannot be written.
     """
     check_size(transitions, seed, num_envs)  # before the bar appears
-    with tqdm(total=transitions, unit="steps", unit_scale=True, desc="collect", file=sys.stderr) as bar:
+    with Progress("collect", transitions) as bar:
 
         def report(done: int, total: int) -> None:
-            bar.update(done - bar.n)
+            bar.advance_to(done, "steps")
 
         rows = collect(collector, transitions, seed, num_envs, report)
     formats.write_hdf5(path, rows, _attributes(collector, rows) | {"seed": seed, "num_envs": num_envs})

@@ -1,4 +1,4 @@
-"""``python -m qdos_brax data``: make a set, look at a file, check one for a task."""
+"""``python -m qdos_brax data``: make, fetch, describe and check data files."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from qdos_brax.data.quality import QUALITY
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
 
-_UNUSABLE = 2  # exit code, as for every error that is the user's to mend
+_UNUSABLE = 2  # exit code, as for every error that the user can fix
 
 
 def add_parser(commands: Any) -> None:
-    """Adds ``data make | info | check`` to the subparsers ``commands``; sets ``run``."""
-    data = commands.add_parser("data", help="make, look at and check data files")
+    """Add ``data make | fetch | info | check`` to the subparsers ``commands``; set the handlers as ``run``."""
+    data = commands.add_parser("data", help="make, fetch, describe and check data files")
     actions = data.add_subparsers(metavar="ACTION", required=True)
 
     make = actions.add_parser("make", help="collect a set, by OGBench's recipes or a mixture of good and bad behaviour")
     make.add_argument("task", metavar="TASK", help="the task, as listed by: python -m qdos_brax tasks")
-    make.add_argument("--out", metavar="FILE", required=True, help="the file to write (.hdf5, D4RL's flat layout)")
+    make.add_argument("--out", metavar="FILE", required=True, help="the file to write (.hdf5 in D4RL's flat layout)")
     make.add_argument("--transitions", metavar="N", type=int, default=200_000, help="rows (default 200000)")
     make.add_argument(
         "--recipe",
@@ -39,7 +39,7 @@ def add_parser(commands: Any) -> None:
         help="OGBench's navigate, stitch or explore, or a mixture of good and bad behaviour (default mixed)",
     )
     make.add_argument(
-        "--mix", metavar="M", help="mixed: share of each behaviour, as expert=0.3,noisy=0.3,wander=0.2,fail=0.2"
+        "--mix", metavar="M", help="mixed: share of each behaviour, such as expert=0.3,noisy=0.3,wander=0.2,fail=0.2"
     )
     make.add_argument(
         "--degraded-share",
@@ -60,27 +60,27 @@ def add_parser(commands: Any) -> None:
     )
     make.set_defaults(run=_make)
 
-    fetch = actions.add_parser("fetch", help="fetch a public set by name, or check one that was fetched")
+    fetch = actions.add_parser("fetch", help="fetch a public set by name, or check one that was fetched before")
     fetch.add_argument("names", metavar="NAME", nargs="+", help=f"such as {sources.examples()}")
     fetch.set_defaults(run=_fetch)
 
     what = "an OGBench .npz, a D4RL .hdf5, a Minari folder, or the name of a public set"
-    info = actions.add_parser("info", help="what is in a data file")
+    info = actions.add_parser("info", help="describe a data file")
     info.add_argument("file", metavar="FILE", help=what)
     info.add_argument("--env", metavar="TASK", help="the task for --map (default: the one the file was made for)")
-    info.add_argument("--map", metavar="FILE", help="also draw where the data has been, as .png")
+    info.add_argument("--map", metavar="FILE", help="also draw the positions in the data, as .png")
     info.set_defaults(run=_info)
 
-    check = actions.add_parser("check", help="whether a data file fits a task; exit code 2 if not")
+    check = actions.add_parser("check", help="check whether a data file fits a task; exit code 2 if not")
     check.add_argument("file", metavar="FILE", help=what)
-    check.add_argument("--env", metavar="TASK", required=True, help="the task it shall be used for")
+    check.add_argument("--env", metavar="TASK", required=True, help="the task to use it for")
     check.add_argument("--horizon", metavar="H", type=int, default=20, help="steps of a segment (default 20)")
-    check.add_argument("--map", metavar="FILE", help="also draw where the data has been, as .png")
+    check.add_argument("--map", metavar="FILE", help="also draw the positions in the data, as .png")
     check.set_defaults(run=_check)
 
 
 def _make(args: argparse.Namespace) -> int:
-    from qdos_brax.runs.jax_setup import prepare_jax  # here, for info and check need no learner
+    from qdos_brax.runs.jax_setup import prepare_jax  # here, since info and check need no learner
 
     prepare_jax()
     path = Path(args.out).expanduser()
@@ -96,27 +96,29 @@ def _recipe(args: argparse.Namespace, env: envs.Task) -> recipes.CollectionRecip
     body = profile_of(env)
     if args.recipe != "mixed":
         if args.mix is not None or args.degraded_share is not None:
-            raise UserError(f"--recipe {args.recipe} takes neither --mix nor --degraded-share; mixed does")
+            raise UserError(
+                f"--recipe {args.recipe} takes neither --mix nor --degraded-share; use them with --recipe mixed"
+            )
         return recipes.named(args.recipe, body, args.noise)
     noise = recipes.NOISE if args.noise is None else args.noise
     if args.mix is None:
         return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, body, noise)
     if args.degraded_share is not None:
-        raise UserError("--mix and --degraded-share both say what is mixed; give one of them")
+        raise UserError("--mix and --degraded-share both set the mixture; give one of them")
     return recipes.mixed(recipes.parse_mix(args.mix), body, noise)
 
 
 def _fetch(args: argparse.Namespace) -> int:
     for name in args.names:
         if sources.find(name) is None:
-            raise UserError(f"there is no public data set {name!r}; there are such as {sources.examples()}")
+            raise UserError(f"there is no public data set {name!r}; give a name such as {sources.examples()}")
     for name in args.names:
-        print(download.resolve(name))
+        print(download.resolve(name).path)
     return 0
 
 
 def _info(args: argparse.Namespace) -> int:
-    path = download.resolve(args.file)
+    path = download.resolve(args.file).path
     rows, attributes = formats.load(path), formats.read_attrs(path)
     for name, value in attributes.items():
         print(f"{name:18s} {value}")
@@ -130,13 +132,13 @@ def _info(args: argparse.Namespace) -> int:
     if args.map:
         task = args.env or attributes.get("env")
         if not task:
-            raise UserError(f"{path} does not say which task it was made for; name it with --env")
+            raise UserError(f"{path} does not name the task it was made for; give it with --env")
         _draw_map(args.map, rows, _env(str(task), "mujoco"), path.name)
     return 0
 
 
 def _describe(rows: Rows) -> None:
-    """Episodes, returns, actions and behaviour of a set that is not empty."""
+    """Print episodes, returns, actions and behaviour of a set that is not empty."""
     bounds = episode_bounds(rows.ends)
     lengths = bounds[:, 1] - bounds[:, 0]
     print(f"{'episodes':18s} {len(lengths):,} of {lengths.min()} to {lengths.max()} steps")
@@ -154,7 +156,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.horizon < 1:
         raise UserError(f"--horizon must be at least 1, got {args.horizon}")
     env = _env(args.env, "mujoco")
-    path = download.resolve(args.file)
+    path = download.resolve(args.file).path
     rows = formats.load(path, env.jump)
     found = checks.inspect(rows, env, args.horizon, formats.read_attrs(path))
     for line in found.errors:
@@ -174,7 +176,7 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _draw_map(out: str, rows: Rows, env: envs.Task, title: str) -> None:
-    from qdos_brax.report.coverage import draw_coverage  # here, for matplotlib takes a while
+    from qdos_brax.report.coverage import draw_coverage  # here, since importing matplotlib takes a while
 
     if rows.qpos is None or rows.qpos.shape[1:] != (env.engine.nq,):
         raise UserError(f"a map needs the simulator states (qpos) of {env.spec.name}, which this file does not hold")
@@ -185,5 +187,5 @@ def _draw_map(out: str, rows: Rows, env: envs.Task, title: str) -> None:
 def _env(name: str, physics: str) -> envs.Task:
     try:
         return envs.make(name, physics=physics)
-    except ValueError as error:  # envs knows nothing of UserError; its lines are made for the user all the same
+    except ValueError as error:  # envs does not know UserError; its messages are written for the user too
         raise UserError(str(error)) from None

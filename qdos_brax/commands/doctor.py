@@ -1,4 +1,4 @@
-"""A look at this machine: what is installed, what jax sees, where caches lie, and whether callbacks come back."""
+"""Check this machine: installed packages, jax's devices, caches, and whether callbacks return."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PACKAGES = (
 )
 _WATCHDOG_SECONDS = 120
 
-# A scan over callbacks, batched, as the MuJoCo C engine makes them. It runs in a process of its own, because a
+# A batched scan over callbacks, as the MuJoCo C engine makes them. It runs in a process of its own, because a
 # callback that hangs cannot be stopped from inside.
 _CALLBACK_PROBE = """
 import jax, jax.numpy as jnp, numpy as np
@@ -44,7 +44,7 @@ assert bool((run(x) == x).all())
 
 
 def examine() -> bool:
-    """Prints one line per check; whether all of them passed."""
+    """Print one line per check; return whether all of them passed."""
     checks: tuple[Callable[[], tuple[bool, str]], ...] = (
         _python,
         _packages,
@@ -80,7 +80,7 @@ def _packages() -> tuple[bool, str]:
 
 
 def _devices() -> tuple[bool, str]:
-    import jax  # here, so that a jax that cannot start is one failed check and not the end of all
+    import jax  # here, so that a jax that cannot start is one failed check and does not end the others
 
     try:
         devices = jax.devices()
@@ -91,14 +91,14 @@ def _devices() -> tuple[bool, str]:
 
 
 def _engines() -> tuple[bool, str]:
-    """Engines that cannot run here are no fault of the machine: "auto" does not choose them."""
+    """List the engines; one that cannot run here is no failure, because "auto" does not choose it."""
     from envs.physics import ENGINES, resolve_physics, why_not
 
     try:
         chosen = resolve_physics("auto")
         obstacles = {engine: why_not(engine) for engine in ENGINES}
     except RuntimeError:
-        return False, "engines: none, for jax cannot start"
+        return False, "engines: none, because jax cannot start"
     run = ", ".join(engine + (" (auto)" if engine == chosen else "") for engine in ENGINES if not obstacles[engine])
     absent = "".join(f"; not {engine}: {obstacle}" for engine, obstacle in obstacles.items() if obstacle)
     return True, f"engines: {run}{absent}"
@@ -127,8 +127,8 @@ def _callbacks() -> tuple[bool, str]:
     try:
         done = subprocess.run(command, timeout=_WATCHDOG_SECONDS, capture_output=True, text=True, check=False)
     except subprocess.TimeoutExpired:
-        return False, f"callbacks: no answer in {_WATCHDOG_SECONDS} s; MuJoCo C cannot be used, take --physics mjx"
+        return False, f"callbacks: no answer in {_WATCHDOG_SECONDS} s; MuJoCo C cannot be used, choose --physics mjx"
     if done.returncode:
         reason = next(reversed(done.stderr.strip().splitlines()), "no message")
-        return False, f"callbacks: failed ({reason}); MuJoCo C cannot be used, take --physics mjx"
-    return True, "callbacks: compiled programs and Python answer each other"
+        return False, f"callbacks: failed ({reason}); MuJoCo C cannot be used, choose --physics mjx"
+    return True, "callbacks: compiled programs can call Python"

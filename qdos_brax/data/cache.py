@@ -12,13 +12,17 @@ from qdos_brax.errors import UserError
 
 
 def folder() -> Path:
-    """Where default sets lie: ``$QDOS_DATA``, else ``~/.cache/qdos_brax/data``."""
+    """Return the folder of the data sets: ``$QDOS_DATA``, else ``~/.cache/qdos_brax/data``."""
     return Path(os.environ.get("QDOS_DATA") or "~/.cache/qdos_brax/data").expanduser()
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Holds the lock of ``path``; the system releases it when the process ends, however it ends."""
+    """Hold the lock of ``path``; the system releases it when the process ends, however it ends.
+
+    Raises:
+        UserError: its folder cannot be written.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = open(path.with_suffix(".lock"), "w")  # noqa: SIM115 (closed below)

@@ -1,10 +1,9 @@
-"""Public data sets by name: fetched once, resumed when broken off, checked by size and SHA-256 ever after."""
+"""Public data sets by name: fetched once, resumed when interrupted, checked by size and SHA-256 ever after."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import http.client
 import json
 import os
@@ -16,7 +15,7 @@ import urllib.request
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 
@@ -25,6 +24,7 @@ from qdos_brax.data import cache, sources
 from qdos_brax.data.sources import Source
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
+from qdos_brax.runs.fingerprints import sha256
 from qdos_brax.runs.progress import Progress
 
 _PIECE = 1 << 20  # bytes per step of the progress bar, and at most per read
@@ -32,7 +32,7 @@ _PIECE = 1 << 20  # bytes per step of the progress bar, and at most per read
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a server is waited for.
+    """Set how long to wait for a server.
 
     Attributes:
         stall: seconds without a byte after which a connection is given up.
@@ -45,37 +45,52 @@ class Patience:
     pause: float = 1.0
 
 
-class _NotThisTime(Exception):
-    """The connection failed; another may not."""
+class DataFile(NamedTuple):
+    """Name a data file.
+
+    Attributes:
+        path: the file, or a Minari folder.
+        sha256: its SHA-256 as 64 hex digits if it is a public set, which is hashed when it is fetched or checked; None
+            for a file of the user's.
+    """
+
+    path: Path
+    sha256: str | None
 
 
-class _NotFromHere(Exception):
-    """This address will not give the file."""
+class _TryAgain(Exception):
+    """Report a failed connection; another may succeed."""
+
+
+class _AddressFailed(Exception):
+    """Report that an address does not give the file."""
 
 
 def check(name: str) -> None:
-    """Raises UserError unless ``name`` is a file or folder that exists or a public data set."""
+    """Raise UserError unless ``name`` is a file or folder that exists or a public data set."""
     if not Path(name).expanduser().exists() and sources.find(name) is None:
         raise UserError(f"{name}: no such file, nor a public data set such as {sources.examples()}")
 
 
-def resolve(name: str) -> Path:
-    """The path of a data set: ``name`` itself where that exists, else the public set of that name, fetched if needed.
+def resolve(name: str) -> DataFile:
+    """Return the file of a data set: ``name`` itself if that exists, else the public set of that name.
+
+    A public set is fetched unless it is in the cache.
 
     Raises:
-        UserError: there is neither, or it cannot be fetched, or what was fetched earlier has changed since.
+        UserError: there is no such file or set, it cannot be fetched, or it has changed since it was fetched.
     """
     check(name)
     path = Path(name).expanduser()
     source = None if path.exists() else sources.find(name)
-    return path if source is None else fetch(source, cache.folder())
+    return DataFile(path, None) if source is None else fetch(source, cache.folder())
 
 
-def fetch(source: Source, folder: Path, patience: Patience = Patience()) -> Path:
-    """The file of ``source`` in ``folder``, downloaded if it is not there yet and checked if it is.
+def fetch(source: Source, folder: Path, patience: Patience = Patience()) -> DataFile:
+    """Return the file of ``source`` in ``folder``: download it if it is missing, check it if it is not.
 
-    What is under the file's name is always whole. A download that broke off goes on where it was, if the server can
-    and still has the same file. Size and SHA-256 are kept in ``FILE.json`` from the first fetch on.
+    A file under this name is always complete. An interrupted download continues where it stopped if the server can do
+    that and still has the same file. Size and SHA-256 are kept in ``FILE.json`` from the first fetch on.
 
     Raises:
         UserError: no address gives the file, it is not what it was at the first fetch, or the disk does not take it.
@@ -83,15 +98,13 @@ def fetch(source: Source, folder: Path, patience: Patience = Patience()) -> Path
     path = folder / source.file_name
     with cache.locked(path):
         if path.exists():
-            _check_record(path)
-            return path
+            return DataFile(path, _check_record(path))
         print(f"fetching  {source.name} into {folder}", flush=True)
         failures = []
         for url in source.urls:
             try:
-                _fetch_from(url, path, patience)
-                return path
-            except _NotFromHere as error:
+                return DataFile(path, _fetch_from(url, path, patience))
+            except _AddressFailed as error:
                 failures.append(f"{url}: {error}")
         raise UserError(
             f"{source.name} cannot be fetched ({'; '.join(failures)}); "
@@ -99,7 +112,8 @@ def fetch(source: Source, folder: Path, patience: Patience = Patience()) -> Path
         )
 
 
-def _fetch_from(url: str, path: Path, patience: Patience) -> None:
+def _fetch_from(url: str, path: Path, patience: Patience) -> str:
+    """Download a file and return its SHA-256."""
     partial = path.with_name(f"{path.name}.part")
     best, fruitless, reason = _size(partial), 0, ""
     while fruitless < patience.attempts:
@@ -108,17 +122,16 @@ def _fetch_from(url: str, path: Path, patience: Patience) -> None:
         try:
             with _disk_errors(path.parent):
                 _continue(url, partial, patience.stall)
-                _keep(partial, path, url)
-            return
-        except _NotThisTime as error:
+                return _keep(partial, path, url)
+        except _TryAgain as error:
             reason = str(error)
             fruitless = 0 if _size(partial) > best else fruitless + 1
             best = max(best, _size(partial))
-    raise _NotFromHere(f"{reason} ({patience.attempts} attempts)")
+    raise _AddressFailed(f"{reason} ({patience.attempts} attempts)")
 
 
 def _continue(url: str, partial: Path, stall: float) -> None:
-    """Brings ``partial`` to the end that the server announces; goes on where it is if the server's file is the same."""
+    """Complete ``partial`` to the announced size; continue where it is if the server's file is the same."""
     state_path = partial.with_name(f"{partial.name}.json")
     state = _read_json(state_path)
     done = _size(partial) if state.get("url") == url and state.get("validator") else 0
@@ -145,34 +158,34 @@ def _connect(request: urllib.request.Request, partial: Path, stall: float) -> An
     except urllib.error.HTTPError as error:
         if error.code == 416:  # what is here is not a beginning of what is there
             partial.unlink(missing_ok=True)
-            raise _NotThisTime("the file there has changed") from None
+            raise _TryAgain("the file there has changed") from None
         answer = f"the server answers {error.code} {error.reason}"
-        raise (_NotThisTime if error.code >= 500 or error.code == 429 else _NotFromHere)(answer) from None
+        raise (_TryAgain if error.code >= 500 or error.code == 429 else _AddressFailed)(answer) from None
     except (OSError, http.client.HTTPException) as error:
-        raise _NotThisTime(f"no connection, {_reason(error)}") from None
+        raise _TryAgain(f"no connection, {_reason(error)}") from None
 
 
 def _receive(response: Any) -> bytes:
-    """What has come of the body since (a stall must not lose it); empty at its end."""
+    """Return the bytes of the body that have arrived since (a stall must not lose them); none at its end."""
     try:
         return bytes(response.read1(_PIECE))
     except (OSError, http.client.HTTPException) as error:
-        raise _NotThisTime(f"the connection broke off, {_reason(error)}") from None
+        raise _TryAgain(f"the connection broke, {_reason(error)}") from None
 
 
 def _begin(response: Any, done: int, state: dict[str, Any]) -> tuple[int, int | None]:
-    """(bytes to keep, size announced) from the server's answer; a server without ranges sends all of it again."""
+    """Return (bytes to keep, size announced) from the answer; a server without ranges sends everything again."""
     length = response.headers.get("Content-Length")
     if response.status != 206:
         return 0, int(length) if length and length.isdigit() else None
     match = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers.get("Content-Range", ""))
     if match is None or int(match[1]) != done or int(match[2]) != (state.get("size") or int(match[2])):
-        raise _NotFromHere("the server goes on elsewhere than asked")
+        raise _AddressFailed("the server continues elsewhere than asked")
     return done, int(match[2])
 
 
 def _copy(response: Any, file: Any, done: int, total: int | None, name: str) -> None:
-    """Appends the body; raises _NotThisTime when it ends before ``total`` bytes are there."""
+    """Append the body; raise _TryAgain when it ends before ``total`` bytes have arrived."""
     pieces = -(-total // _PIECE) if total else 0
     first, shown, began = done, done // _PIECE, time.monotonic()
     with Progress(f"fetch {name}", max(1, pieces), shown, waiting_for="connected") as progress:
@@ -184,11 +197,11 @@ def _copy(response: Any, file: Any, done: int, total: int | None, name: str) -> 
                 progress.advance((done - first) / 1e6 / max(1e-3, time.monotonic() - began), "MB", float("nan"))
     file.truncate()
     if total is not None and done < total:
-        raise _NotThisTime(f"truncated at {done:,} of {total:,} bytes")
+        raise _TryAgain(f"truncated at {done:,} of {total:,} bytes")
 
 
-def _keep(partial: Path, path: Path, url: str) -> None:
-    """Gives a whole download its name, with its record; raises _NotFromHere when it is no data file."""
+def _keep(partial: Path, path: Path, url: str) -> str:
+    """Rename a complete download, write its record, return its SHA-256; raise _AddressFailed if it is no data file."""
     state_path = partial.with_name(f"{partial.name}.json")
     try:
         if path.suffix == ".npz":
@@ -197,12 +210,12 @@ def _keep(partial: Path, path: Path, url: str) -> None:
             h5py.File(partial, "r").close()
     except (OSError, zipfile.BadZipFile):
         partial.unlink()
-        raise _NotFromHere("what the server sent is not a data file, or only a part of one") from None
+        raise _AddressFailed("what the server sent is not a data file, or only a part of one") from None
     found = _describe(partial) | {"url": url}
     earlier = _read_json(_record(path))
     if earlier and (earlier.get("size"), earlier.get("sha256")) != (found["size"], found["sha256"]):
         partial.unlink()
-        raise _NotFromHere(
+        raise _AddressFailed(
             f"the file there is not the one first fetched; to accept it, remove {_record(path)} (SHA-256 "
             f"{found['sha256'][:12]}, then {str(earlier.get('sha256'))[:12]})"
         )
@@ -211,10 +224,11 @@ def _keep(partial: Path, path: Path, url: str) -> None:
     write_text(_record(path), json.dumps(found, indent=2) + "\n")
     os.replace(partial, path)
     state_path.unlink(missing_ok=True)
+    return str(found["sha256"])
 
 
-def _check_record(path: Path) -> None:
-    """Raises UserError when ``path`` is not what its record says; a file put there by hand gets its record now."""
+def _check_record(path: Path) -> str:
+    """Return the SHA-256 of ``path``; raise UserError if its record differs. A file put there by hand gets a record."""
     record = _read_json(_record(path))
     found = _describe(path)
     if not record:
@@ -224,11 +238,11 @@ def _check_record(path: Path) -> None:
             f"{path} has changed since it was fetched ({found['size']:,} bytes, SHA-256 {found['sha256'][:12]}; "
             f"then {record.get('size')}, {str(record.get('sha256'))[:12]}): remove it and it is fetched again"
         )
+    return str(found["sha256"])
 
 
 def _describe(path: Path) -> dict[str, Any]:
-    with path.open("rb") as file:
-        return {"size": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+    return {"size": path.stat().st_size, "sha256": sha256(path)}
 
 
 def _size(path: Path) -> int:
@@ -240,7 +254,7 @@ def _record(path: Path) -> Path:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """A small JSON object, or {} where there is none or half of one."""
+    """Return a small JSON object; {} if the file is missing or damaged."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -256,17 +270,19 @@ def _check_space(folder: Path, total: int | None, done: int) -> None:
 
 @contextlib.contextmanager
 def _disk_errors(folder: Path) -> Any:
-    """Turns what the disk refuses into one clear line; what was fetched stays for the next time."""
+    """Turn what the disk refuses into one clear line; what was fetched stays for the next time."""
     try:
         yield
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        mend = "free some space and start again, it goes on where it was" if full else "set QDOS_DATA to another folder"
-        raise UserError(f"{folder} does not take the file ({error.strerror or error}); {mend}") from None
+        remedy = (
+            "free some space and start again, it continues where it was" if full else "set QDOS_DATA to another folder"
+        )
+        raise UserError(f"{folder} does not take the file ({error.strerror or error}); {remedy}") from None
 
 
 def _reason(error: Any) -> str:
     cause = getattr(error, "reason", error)  # of a URLError
     if isinstance(cause, TimeoutError):
-        return "nothing came any more"
+        return "no more bytes arrived"
     return " ".join(str(getattr(cause, "strerror", None) or cause or type(cause).__name__).split())

@@ -1,8 +1,7 @@
-"""Dataset files in and out: which reader takes a file, the task's labels, and the ``.hdf5`` that is written here."""
+"""Reading and writing dataset files: which reader takes a file, the task's labels, our own ``.hdf5``."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -22,6 +21,7 @@ from qdos_brax.data.readers import d4rl, minari, ogbench
 from qdos_brax.data.readers.rows import Rows, unreadable
 from qdos_brax.data.readers.table import CHECKSUMS, checksum
 from qdos_brax.errors import UserError
+from qdos_brax.files import replacing, user_errors
 
 _CHUNK_BYTES = 1 << 19
 
@@ -88,24 +88,17 @@ def write_hdf5(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], a
         UserError: the folder or the disk does not take the file.
     """
     path = Path(path).expanduser()
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with user_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        # From version 1.10 of the format on, HDF5 guards its own structures by checksums.
-        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
-            for key, array in arrays.items():
-                row_bytes = max(1, math.prod(array.shape[1:]) * array.dtype.itemsize)
-                chunk = (max(1, min(len(array), _CHUNK_BYTES // row_bytes)), *array.shape[1:])
-                file.create_dataset(key, data=array, compression="lzf", chunks=chunk)
-            for name, value in attrs.items():
-                file.attrs[name] = value
-            file.attrs[CHECKSUMS] = json.dumps({key: checksum(array) for key, array in arrays.items()})
-        os.replace(partial, path)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
+    # From version 1.10 of the format on, HDF5 guards its own structures by checksums.
+    with replacing(path) as partial, h5py.File(partial, "w", libver=("v110", "v110")) as file:
+        for key, array in arrays.items():
+            row_bytes = max(1, math.prod(array.shape[1:]) * array.dtype.itemsize)
+            chunk = (max(1, min(len(array), _CHUNK_BYTES // row_bytes)), *array.shape[1:])
+            file.create_dataset(key, data=array, compression="lzf", chunks=chunk)
+        for name, value in attrs.items():
+            file.attrs[name] = value
+        file.attrs[CHECKSUMS] = json.dumps({key: checksum(array) for key, array in arrays.items()})
 
 
 def read_attrs(path: str | os.PathLike[str]) -> dict[str, Any]:

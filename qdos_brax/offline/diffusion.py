@@ -57,7 +57,9 @@ def variance_preserving_schedule(steps: int) -> Schedule:
 
 
 def add_noise(schedule: Schedule, action: jax.Array, step: jax.Array, noise: jax.Array) -> jax.Array:
-    """Return the action after step + 1 noising steps: sqrt(alpha_bar) a + sqrt(1 - alpha_bar) noise; ``step`` is int32[B]."""
+    """Return the action after step + 1 noising steps: sqrt(alpha_bar) a + sqrt(1 - alpha_bar) noise; ``step`` is
+    int32[B].
+    """
     alpha_bar = schedule.alpha_bar[step][..., None]
     return jnp.sqrt(alpha_bar) * action + jnp.sqrt(1 - alpha_bar) * noise
 

@@ -144,7 +144,8 @@ class Hilbert:
         return jnp.sqrt(jnp.maximum(squared, 1e-6))
 
     def distance_loss(self, phi: Params, target_phi: Params, batch: GoalBatch, hyper: HilbertHyper) -> jax.Array:
-        """Return the loss of the expectile regression of V = -distance to -1 + discount V(s', g), each head to its own target.
+        """Return the loss of the expectile regression of V = -distance to -1 + discount V(s', g), each head to its
+        own target.
 
         The side of the expectile is that of the smaller next value against the mean of the heads, both of the target.
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import IO
 import numpy as np
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import user_errors
+from qdos_brax.files import replacing
 
 
 @contextlib.contextmanager
@@ -33,35 +32,30 @@ def mp4(out: Path, height: int, width: int, fps: float) -> Iterator[Callable[[np
     if out.suffix != ".mp4":
         raise UserError(f"a video is written as .mp4, not as {out.name}; choose another name for it")
     ffmpeg = _ffmpeg()
-    partial = out.with_name(f".{out.stem}.partial.mp4")  # ffmpeg takes the format from the ending
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
     coding = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2"]
-    with user_errors(out):
+    with replacing(out) as partial:  # of the same ending, from which ffmpeg takes the format
         partial.touch()  # raises at once, with the reason, if it cannot be written
-        try:
-            # imageio_ffmpeg.write_frames runs Python between fork and exec, where other threads (JAX has some) can
-            # make it hang. process_group keeps Ctrl-C away from ffmpeg without that.
-            with subprocess.Popen(
-                [ffmpeg, "-v", "error", "-y", *source, *coding, str(partial)],
-                stdin=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                process_group=0,
-            ) as process:
-                assert process.stdin is not None
-                feed = process.stdin
-                try:
-                    yield lambda frame: _send(feed, frame)
-                except BaseException:
-                    process.kill()
-                    with contextlib.suppress(BrokenPipeError):  # some frames may still be unsent
-                        feed.close()
-                    raise
-                _, errors = process.communicate()
-            if process.returncode:
-                raise UserError(f"cannot write {out}: ffmpeg says {' '.join(errors.decode(errors='replace').split())}")
-            os.replace(partial, out)
-        finally:
-            partial.unlink(missing_ok=True)
+        # imageio_ffmpeg.write_frames runs Python between fork and exec, where other threads (JAX has some) can make it
+        # hang. process_group keeps Ctrl-C away from ffmpeg without that.
+        with subprocess.Popen(
+            [ffmpeg, "-v", "error", "-y", *source, *coding, str(partial)],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            process_group=0,
+        ) as process:
+            assert process.stdin is not None
+            feed = process.stdin
+            try:
+                yield lambda frame: _send(feed, frame)
+            except BaseException:
+                process.kill()
+                with contextlib.suppress(BrokenPipeError):  # some frames may still be unsent
+                    feed.close()
+                raise
+            _, errors = process.communicate()
+        if process.returncode:
+            raise UserError(f"cannot write {out}: ffmpeg says {' '.join(errors.decode(errors='replace').split())}")
 
 
 def _send(feed: IO[bytes], frame: np.ndarray) -> None:

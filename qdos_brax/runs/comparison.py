@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import user_errors, write_text
+from qdos_brax.files import replacing_folder, user_errors, write_text
 from qdos_brax.runs.folder import RunFolder
 
 _FILE = "comparison.json"
 
 
 def is_comparison(path: str | Path) -> bool:
-    """Whether there is a comparison at ``path``."""
+    """Return whether there is a comparison at ``path``."""
     return (Path(path) / _FILE).is_file()
 
 
 def create(path: Path, configs: Mapping[str, str]) -> None:
-    """Makes the folder with its run folders, none of them begun; all at once or not at all.
+    """Create the folder with its run folders, none of them begun; completely or not at all.
 
     Args:
         path: the comparison's folder, absent or empty.
@@ -30,22 +28,20 @@ def create(path: Path, configs: Mapping[str, str]) -> None:
     Raises:
         UserError: there is something at ``path``, or it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
     with user_errors(path):
         if is_comparison(path):
-            raise UserError(f"{path} holds a comparison already; go on with --resume {path} or choose another --out")
+            raise UserError(f"{path} holds a comparison already; continue with --resume {path} or choose another --out")
         if path.exists() and any(path.iterdir()):
             raise UserError(f"{path} is not empty; choose another --out")
-        shutil.rmtree(partial, ignore_errors=True)
+    with replacing_folder(path) as partial:
         for name, text in configs.items():
-            (partial / name).mkdir(parents=True)
+            (partial / name).mkdir()
             write_text(RunFolder(partial / name).config, text)
         write_text(partial / _FILE, json.dumps({"runs": list(configs)}) + "\n")
-        os.replace(partial, path)
 
 
 def runs(path: Path) -> dict[str, RunFolder]:
-    """The run folders by name, in order.
+    """Return the run folders by name, in order.
 
     Raises:
         UserError: there is no comparison at ``path``, or it is damaged.

@@ -12,7 +12,7 @@ import jaxlib
 
 
 def cache_folder() -> Path:
-    """Where compiled programs lie: ``JAX_COMPILATION_CACHE_DIR``, or a folder per machine in the user's cache.
+    """Return the folder of compiled programs: ``JAX_COMPILATION_CACHE_DIR``, or one per machine in the user's cache.
 
     Programs are compiled for one processor; a home folder shared by several machines must keep them apart, or each
     rejects the others' entries (jax issue 38445).
@@ -25,7 +25,7 @@ def cache_folder() -> Path:
 
 
 def enable() -> Path | None:
-    """Turns the cache on for every program from here on; None where its folder cannot be written."""
+    """Turn the cache on for every later program and return its folder; None if that cannot be written."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -39,7 +39,7 @@ def enable() -> Path | None:
 
 
 def _machine() -> str:
-    """12 hex digits that name the processor and the compiler's version."""
+    """Return 12 hex digits that name the processor and the compiler's version."""
     cpu = platform.processor()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()

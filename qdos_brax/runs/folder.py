@@ -1,4 +1,4 @@
-"""The run folder: what lies where, and who may write to it."""
+"""The run folder: its files, and the lock by which one process at a time may write to it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from qdos_brax.files import is_partial, user_errors
 
 
 class RunFolder:
-    """One run's folder, held by one process at a time.
+    """Name the files of a run's folder, and hold its lock.
 
     Attributes:
         path: the folder.
-        config: config.yaml, whole and resolved.
+        config: config.yaml, complete and resolved.
         metrics: metrics.csv, one row per member and log point.
         provenance: run.json: the command, the data file's hash, the versions of the packages.
-        summary: summary.json, present once the run has ended.
+        summary: summary.json, present once the run has finished.
         tensorboard: folder of TensorBoard's event files.
-        wandb: wandb.json, the run's name at Weights & Biases, if it is logged there.
-        inside: inside.npz, what a look inside the finished run found.
+        wandb: wandb.json, the run's name at Weights & Biases if it is logged there.
+        inside: inside.npz, the analysis of the finished run.
         checkpoints: folder of the checkpoints.
     """
 
@@ -43,7 +43,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: str | Path) -> RunFolder:
-        """A new run folder; ``path`` must be absent, empty, or left by a run that had not begun to train.
+        """Create a run folder; ``path`` must be absent, empty, or left by a run that had not begun to train.
 
         Raises:
             UserError: there is something else at ``path``, or it cannot be written.
@@ -52,7 +52,7 @@ class RunFolder:
         with user_errors(folder.path):
             if folder.metrics.exists():
                 raise UserError(
-                    f"{folder.path} holds a run already; go on with --resume {folder.path} or choose another --out"
+                    f"{folder.path} holds a run already; continue with --resume {folder.path} or choose another --out"
                 )
             before_training = {folder.config, folder.provenance, folder.checkpoints, folder.path / ".lock"}
             found = set(folder.path.iterdir()) if folder.path.exists() else set()
@@ -63,7 +63,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
-        """The folder of a run that was started before.
+        """Return the folder of a run that was started before.
 
         Raises:
             UserError: there is no run at ``path``.
@@ -75,7 +75,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Holds the folder for this process; the hold ends with the process, however that ends.
+        """Lock the folder for this process; the lock ends with the process, however that ends.
 
         Raises:
             UserError: another process holds it, or it cannot be written.
@@ -86,13 +86,13 @@ class RunFolder:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise UserError(f"another process is at work in {self.path}; wait for it or stop it") from None
+                raise UserError(f"another process works in {self.path}; wait for it or stop it") from None
             yield
         finally:
             os.close(descriptor)
 
     def is_held(self) -> bool:
-        """Whether a process holds the folder."""
+        """Return whether a process holds the lock."""
         try:
             with self.held():
                 return False
@@ -100,7 +100,11 @@ class RunFolder:
             return True
 
     def read_summary(self) -> dict[str, Any] | None:
-        """summary.json, or None where the run has not ended."""
+        """Return the content of summary.json; None if the run has not finished.
+
+        Raises:
+            UserError: the file is damaged.
+        """
         if not self.summary.is_file():
             return None
         try:
@@ -111,7 +115,7 @@ class RunFolder:
 
 
 def new_path(root: str | Path, name: str) -> Path:
-    """A folder under ``root`` that does not exist yet: the name and the time, numbered if taken."""
+    """Return a folder under ``root`` that does not exist yet: the name and the time, numbered if taken."""
     base = Path(root) / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
     path, count = base, 1
     while path.exists():

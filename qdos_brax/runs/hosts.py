@@ -1,8 +1,8 @@
 """Several processes, on one host or many, that share the members of a run.
 
-jax finds the processes (flags, or what Slurm, Open MPI and Kubernetes set) and tells each which accelerators are its
-own. From then on they need each other only through the run's folder: members do not exchange anything, so that a
-process that dies takes no other with it.
+jax finds the processes (flags, or what Slurm, Open MPI and Kubernetes set) and gives each its own accelerators. From
+then on they communicate only through the run's folder: members do not exchange anything, so that a process that dies
+takes no other with it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from qdos_brax.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Hosts:
-    """This process among those of the run: number ``index`` of ``count``."""
+    """Hold the number of this process, ``index`` from 0, and the ``count`` of all that share the run."""
 
     index: int = 0
     count: int = 1
@@ -26,15 +26,15 @@ ALONE = Hosts()
 
 
 def join(coordinator: str | None, processes: int | None, process_id: int | None) -> Hosts:
-    """Meets the other processes; must come before anything else asks jax for its devices.
+    """Connect to the other processes; must come before anything else asks jax for its devices.
 
     Args:
-        coordinator: "host:port" of the first process; None where the cluster's variables say it.
-        processes: how many; None likewise.
-        process_id: this one's number, from 0; None likewise.
+        coordinator: "host:port" of the first process; None where the cluster's variables give it.
+        processes: number of processes; None likewise.
+        process_id: number of this one, from 0; None likewise.
 
     Raises:
-        UserError: they did not meet.
+        UserError: the processes did not connect.
     """
     from jax._src import distributed  # jax has no public way to ask for the number before it starts its devices
 
@@ -44,9 +44,9 @@ def join(coordinator: str | None, processes: int | None, process_id: int | None)
         jax.distributed.shutdown()  # waits for all
     except (ValueError, TypeError, RuntimeError) as error:
         raise UserError(
-            f"--distributed: the processes did not meet ({str(error).splitlines()[0]}); outside Slurm, Open MPI and "
+            f"--distributed: the processes did not connect ({str(error).splitlines()[0]}); outside Slurm, Open MPI and "
             "Kubernetes give --coordinator HOST:PORT, --processes N and --process-id I"
         ) from error
-    # Otherwise jax goes on numbering devices as one of many, and Orbax refuses what only one process has.
+    # Otherwise jax would still number devices as one of many, and Orbax refuses what only one process has.
     distributed.global_state.process_id, distributed.global_state.num_processes = 0, 1
     return hosts

@@ -13,10 +13,10 @@ _SHOWN = {"success": "eval/success", "return": "eval/return", "first goal": "fir
 
 
 class MemberBoard:
-    """A table of the members' latest numbers, made anew whenever rich draws it.
+    """Show a table of the members' latest numbers, built again whenever rich draws it.
 
     Args:
-        members: what tells them apart; what is the same for all is not shown, but for the seed.
+        members: the population; keys with one value for all are not shown, except for the seed.
     """
 
     def __init__(self, members: Sequence[Mapping[str, Any]]) -> None:
@@ -26,11 +26,11 @@ class MemberBoard:
         self._loss = ["" for _ in members]
 
     def begin(self, rows: Sequence[Row]) -> None:
-        """Takes the rows so far."""
+        """Add the rows so far."""
         self.append(rows)
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Takes new rows."""
+        """Add new rows."""
         for row in rows:
             index, numbers = int(row["member"]), measured(row, self._members)
             self._latest[index] |= numbers
@@ -39,10 +39,10 @@ class MemberBoard:
                 self._loss[index] = f"{numbers[losses[0]]:.4g} ({losses[0].removesuffix('_loss').replace('_', ' ')})"
 
     def end(self) -> None:
-        """Nothing is to be closed."""
+        """Do nothing: there is nothing to close."""
 
     def __rich__(self) -> Table:
-        """The table as it stands."""
+        """Return the current table."""
         table = Table(box=None, pad_edge=False, header_style="bold")
         for name in (*self._names, *_SHOWN, "loss", ""):
             table.add_column(name.rpartition(".")[2].replace("_", " "), justify="right", no_wrap=True)

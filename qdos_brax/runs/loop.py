@@ -1,7 +1,7 @@
 """The loop over phases: chunks, log points, checkpoints. It knows no learner.
 
-A run that is killed and goes on ends as it would have ended: a checkpoint holds everything a chunk reads, the phase's
-constants come again from ``init``, and metrics.csv is cut back to the checkpoint's rows.
+A run that is killed and continued ends as it would have ended without the kill: a checkpoint holds everything a chunk
+reads, the phase's constants come again from ``init``, and metrics.csv is cut back to the checkpoint's rows.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Phase(Protocol):
 
 @dataclasses.dataclass
 class _Place:
-    """Where the loop is; ``state`` is None at the start of a phase, else (state, constants)."""
+    """Hold where the loop is; ``state`` is None at the start of a phase, else (state, constants)."""
 
     phase: int
     chunk: int
@@ -88,11 +88,11 @@ def run_phases(
     data_seconds: float = 0.0,
     started: float | None = None,
     observers: Sequence[Observer] = (),
-) -> dict[str, Any]:
-    """Runs the phases to their end, from the newest usable checkpoint if there is one.
+) -> tuple[dict[str, Any], Artifacts]:
+    """Run the phases to their end, from the newest usable checkpoint if there is one.
 
     Args:
-        phases: in order.
+        phases: the phases in order.
         folder: the run's folder, held by the caller.
         members: the population: dicts with "seed", "alpha" and whatever else varies.
         config: hash of the configuration.
@@ -100,20 +100,20 @@ def run_phases(
         checkpoint_seconds: seconds of work between two checkpoints; 0 saves after every chunk.
         data_seconds: seconds that this process spent on the data.
         started: ``time.perf_counter()`` at this process's start; None for now.
-        observers: are told of every row of metrics.csv.
+        observers: receive every row of metrics.csv.
 
     Returns:
-        The summary, as written to summary.json.
+        The summary, as written to summary.json, and the artifacts of the last phase.
 
     Raises:
         UserError: the disk refuses, or no checkpoint can be used.
-        SystemExit: SIGINT or SIGTERM came; the run was saved, and the code is 130 or 143.
+        SystemExit: SIGINT or SIGTERM arrived; the run was saved, and the code is 130 or 143.
     """
     store = CheckpointStore(folder.checkpoints, config)
     table = MetricsTable(folder.metrics, members)
     clock = _Clock(data_seconds, time.perf_counter() if started is None else started)
     keys = _member_keys(members)
-    place = checkpoint.choose(store, lambda name: _restore(name, store, phases, keys, table, clock), signals.say)
+    place = checkpoint.choose(store, lambda name: _restore(name, store, phases, keys, table, clock), signals.warn)
     if place is None:
         table.start()
         place = _Place(0, 0, {}, None)
@@ -124,12 +124,12 @@ def run_phases(
             place = runner.run(phases[place.phase], place)
     summary = {**header, "wall_seconds": clock.parts(), "members": table.summary()}
     write_text(folder.summary, json.dumps(summary, indent=2) + "\n")
-    return summary
+    return summary, place.artifacts
 
 
 @dataclasses.dataclass
 class _Runner:
-    """What every phase of a run shares."""
+    """Run phases one by one; hold what they share."""
 
     folder: RunFolder
     store: CheckpointStore
@@ -182,14 +182,14 @@ class _Runner:
         return state
 
     def _save(self, phase: int, chunk: int, state: Any | None) -> float:
-        """Saves, and says how many seconds that took."""
+        """Save the run; return how many seconds that took."""
         started = time.monotonic()
         place = checkpoint.Position(phase, chunk, len(self.table.rows), tuple(self.table.columns), self.clock.parts())
         self.store.save(place, state)
         return time.monotonic() - started
 
     def _pause(self, save_seconds: float) -> float:
-        """Seconds of work before the next save; where saving is slow, it stays below a twentieth of the time."""
+        """Return the seconds of work before the next save: where saving is slow, at least 20 times as long."""
         return max(self.checkpoint_seconds, 20 * save_seconds) if self.checkpoint_seconds else 0.0
 
     def _stop(self) -> None:
@@ -197,7 +197,7 @@ class _Runner:
 
 
 class _Clock:
-    """Wall seconds by part of the run, added up over all processes that worked on it."""
+    """Measure wall seconds by part of the run, added up over all processes that worked on it."""
 
     def __init__(self, data_seconds: float, started: float) -> None:
         self._parts = dict.fromkeys(_WALL_PARTS, 0.0)
@@ -207,21 +207,21 @@ class _Clock:
         self._mark = time.perf_counter()
 
     def add_earlier(self, parts: Mapping[str, float]) -> None:
-        """Counts what earlier processes spent."""
+        """Count what earlier processes spent."""
         self._earlier = parts["total"]
         for name, seconds in parts.items():
             if name != "total":
                 self._parts[name] += seconds
 
     def charge(self, part: str, eval_seconds: float = 0.0) -> None:
-        """Books the time since the last call to ``part``, but for ``eval_seconds`` of it."""
+        """Count the time since the last call for ``part``, except ``eval_seconds`` of it, which count for "eval"."""
         now = time.perf_counter()
         self._parts[part] += now - self._mark - eval_seconds
         self._parts["eval"] += eval_seconds
         self._mark = now
 
     def parts(self) -> dict[str, float]:
-        """Seconds by part, and in total (which counts imports and reading too)."""
+        """Return seconds by part, and in total (which counts imports and reading too)."""
         total = self._earlier + time.perf_counter() - self._started
         return {**{name: round(seconds, 3) for name, seconds in self._parts.items()}, "total": round(total, 3)}
 
@@ -252,7 +252,7 @@ def _restore(
 
 
 def _member_keys(members: Sequence[Mapping[str, Any]]) -> jax.Array:
-    """Typed keys[members] from the seeds; members that share a seed share the key and differ in the rest."""
+    """Return typed keys[members] from the seeds; members that share a seed share the key."""
     return jax.vmap(jax.random.key)(np.asarray([member["seed"] for member in members], np.uint32))
 
 
@@ -261,7 +261,7 @@ def _phase_keys(keys: jax.Array, phase: int) -> jax.Array:
 
 
 def _mean(values: Any) -> float:
-    """The mean of the numbers that are there; nan if there is none."""
+    """Return the mean of the numbers that are not nan; nan if there is none."""
     numbers = np.asarray(values, np.float64)
     numbers = numbers[~np.isnan(numbers)]
     return float(numbers.mean()) if numbers.size else float("nan")

@@ -1,4 +1,4 @@
-"""metrics.csv: one row per member and log point, and the summary that is read off it."""
+"""metrics.csv: one row per member and log point, and the summary that follows from it."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ _LAST = "sps"
 
 
 class Observer(Protocol):
-    """Someone who is told what is written into metrics.csv, which stays the truth."""
+    """Receive every row that is written to metrics.csv."""
 
     def begin(self, rows: Sequence[Row]) -> None:
-        """The run begins, or goes on with these rows; what was told of others before does not count any more."""
+        """Start with the rows of the run so far; forget rows that an earlier process sent."""
         ...
 
     def append(self, rows: Sequence[Row]) -> None:
-        """A log point: one new row per member, with a cell for each column that it has."""
+        """Take a log point: one new row per member, with a cell for each column that it has."""
         ...
 
     def end(self) -> None:
-        """The run ends or stops."""
+        """Finish, because the run ends or stops."""
         ...
 
 
 class MetricsTable:
-    """The rows so far, in memory and on disk.
+    """Hold the rows so far, in memory and on disk.
 
-    A column may appear late: the file is then rewritten at once with the new header, and earlier rows hold an empty
-    cell there. An absent number is an empty cell, never 0.
+    A column may appear late: the file is then replaced by one with the new header, and earlier rows have an empty cell
+    there. A missing number is an empty cell, never 0.
 
     Args:
         path: the CSV file.
-        members: what tells the members apart ("seed", "alpha", ...), in the population's order.
+        members: the population in order: what varies between the members ("seed", "alpha", ...).
     """
 
     def __init__(self, path: Path, members: Sequence[Mapping[str, Any]]) -> None:
@@ -57,7 +57,7 @@ class MetricsTable:
 
     @contextlib.contextmanager
     def observed(self, observers: Sequence[Observer]) -> Iterator[None]:
-        """Tells the observers of the rows that are there and of those to come."""
+        """Send the rows so far and all new ones to the observers."""
         self._observers = observers
         try:
             for observer in observers:
@@ -69,11 +69,11 @@ class MetricsTable:
                 observer.end()
 
     def start(self) -> None:
-        """Writes the header of a new table."""
+        """Write the header of a new table."""
         self._rewrite()
 
     def cut_back(self, rows: int, columns: Sequence[str]) -> None:
-        """Reads the file and keeps its first ``rows``, under the ``columns`` of that time.
+        """Read the file and keep its first ``rows``, with the ``columns`` that they had.
 
         Raises:
             UserError: the file holds fewer rows than that, or none of those columns.
@@ -90,7 +90,7 @@ class MetricsTable:
         self._rewrite()
 
     def append(self, phase: str, metrics: Mapping[str, Any], sps: float) -> None:
-        """Adds one row per member.
+        """Add one row per member.
 
         Args:
             phase: the phase's name.
@@ -115,11 +115,11 @@ class MetricsTable:
             observer.append(rows)
 
     def latest(self, column: str) -> list[float]:
-        """The last number of the column for each member; nan where there was none yet."""
+        """Return the last number of the column for each member; nan where there is none yet."""
         return [latest.get(column, math.nan) for latest in self._latest]
 
     def summary(self) -> list[dict[str, Any]]:
-        """One entry per member, as summary.json holds it; what was never measured is None."""
+        """Return one entry per member, as in summary.json; what was never measured is None."""
         return [self._member_summary(i) for i in range(len(self._members))]
 
     def _member_summary(self, index: int) -> dict[str, Any]:
@@ -149,12 +149,12 @@ class MetricsTable:
 
 
 def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
-    """Writes a whole table at once."""
+    """Replace the file by a whole table at once."""
     write_text(path, ",".join(columns) + "\n" + _text(columns, rows))
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a metrics file, without a last line that a kill left incomplete.
+    """Return the rows of a metrics file, without a last line that a kill left incomplete.
 
     Raises:
         UserError: the file is missing or is not a metrics file.
@@ -171,11 +171,11 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def measured(row: Row, members: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """The numbers of a row by column: without what names the member and the step, and without those that are not there.
+    """Return the measurements of a row by column: without nan, the member's keys and the step.
 
     Args:
-        row: of metrics.csv.
-        members: the population; what tells its members apart is no measure.
+        row: a row of metrics.csv.
+        members: the population; its keys are no measurements.
     """
     names = {"member", *members[0], "phase", "env_steps", "update"}
     numbers = {name: float(cell) for name, cell in row.items() if cell and name not in names}
@@ -183,7 +183,7 @@ def measured(row: Row, members: Sequence[Mapping[str, Any]]) -> dict[str, float]
 
 
 def step_of(row: Row) -> int:
-    """Where on its phase's axis a row stands: environment steps once there are any, else updates."""
+    """Return a row's position on the axis of its phase: environment steps once there are any, else updates."""
     return int(float(row.get("env_steps") or 0)) or int(float(row.get("update") or 0))
 
 
@@ -194,7 +194,7 @@ def _text(columns: Sequence[str], rows: Sequence[Row]) -> str:
 
 
 def _cell(value: Any) -> str:
-    """A number as text: whole numbers exact, the others with the nine digits that tell float32 apart."""
+    """Return a number as text: whole numbers exactly, others with the nine digits that identify a float32."""
     number = np.asarray(value).item()
     return str(int(number)) if isinstance(number, int | bool) else f"{number:.9g}"
 

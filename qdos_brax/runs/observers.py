@@ -1,4 +1,4 @@
-"""Who else is told what metrics.csv holds: TensorBoard, Weights & Biases."""
+"""Observers of metrics.csv: TensorBoard, Weights & Biases."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _OBSERVERS: dict[str, Callable[[RunFolder, Sequence[Mapping[str, Any]]], Observe
 
 
 def check(wanted: Any) -> None:
-    """Raises UserError if something that ``wanted`` (the configuration's ``run``) asks for is not installed."""
+    """Raise UserError if something that ``wanted`` (the configuration's ``run``) asks for is not installed."""
     if wanted.wandb:
         wandb_log.load()
 
 
 def make(wanted: Any, folder: RunFolder, members: Sequence[Mapping[str, Any]]) -> list[Observer]:
-    """Those that ``wanted`` asks for, by the observers' names.
+    """Return the observers that ``wanted`` asks for by name.
 
     Args:
         wanted: the configuration's ``run``.
         folder: the run's folder.
-        members: the population, as metrics.csv names it.
+        members: the population, with the keys that metrics.csv has.
     """
     return [make_one(folder, members) for name, make_one in _OBSERVERS.items() if getattr(wanted, name)]

@@ -1,4 +1,4 @@
-"""What a run says while it works: a line that moves on a terminal, a line now and then elsewhere."""
+"""Progress of long work: a bar on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from typing import Self, TextIO
 from rich import progress
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from tqdm import tqdm
 
 _QUIET_SECONDS = 10.0
 
 
 class Progress:
-    """One phase's progress: its name, its rate, the time left, the latest success.
+    """Show the progress of a phase or another long work: its name, rate, time left, latest success.
 
     Args:
-        phase: the phase's name.
-        total: its chunks.
-        done: chunks that an earlier process has done.
-        stream: where to write; a bar if it is a terminal, else a line every ten seconds and at the end.
-        waiting_for: what the bar says until the first chunk is done.
-        below: what a terminal shows below the bar until the phase ends, drawn anew with it.
+        phase: name of the work.
+        total: its size, in chunks or any other unit.
+        done: how much of it an earlier process has done.
+        stream: where to write (default stderr); a bar if it is a terminal, else a line every ten seconds and one at
+            the end.
+        waiting_for: note beside the bar until there is a rate.
+        below: what a terminal shows below the bar until the work ends, drawn again whenever the bar is.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Progress:
     ) -> None:
         self._phase, self._total, self._first, self._done = phase, total, done, done
         self._stream = stream or sys.stderr
-        self._started = self._spoken = time.monotonic()
+        self._started = self._printed = time.monotonic()
         self._live = None
         if self._stream.isatty():
             self._bar = progress.Progress(
@@ -61,29 +61,47 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._live is not None:
-            self._live.update(self._bar)  # only the line stays
+            self._live.update(self._bar)  # only the bar stays
             self._live.stop()
 
     def advance(self, rate: float, unit: str, success: float) -> None:
-        """One chunk is done.
+        """Show that one more chunk is done.
 
         Args:
             rate: steps per second in it.
-            unit: what a step is ("updates", "env steps").
+            unit: name of a step ("updates", "env steps").
             success: mean latest success of the members, 0 to 1; nan if none was measured.
         """
-        self._done += 1
         note = f"{rate:,.0f} {unit}/s" + ("" if math.isnan(success) else f", success {success:.2f}")
+        self._show(self._done + 1, note)
+
+    def advance_to(self, done: int, unit: str) -> None:
+        """Show how much is done, and the mean rate so far.
+
+        Args:
+            done: amount that is done, of ``total``.
+            unit: name of what is counted ("steps").
+        """
+        rate = (done - self._first) / max(time.monotonic() - self._started, 1e-3)
+        self._show(done, f"{rate:,.0f} {unit}/s")
+
+    def _show(self, done: int, note: str) -> None:
+        self._done = done
         if self._live is not None:
             self._bar.update(self._task, completed=self._done, note=note)
             self._live.refresh()
             return
         now = time.monotonic()
-        if self._done == self._total or now - self._spoken >= _QUIET_SECONDS:
-            self._spoken = now
+        if self._done == self._total or now - self._printed >= _QUIET_SECONDS:
+            self._printed = now
             spent = now - self._started
-            left = spent / (self._done - self._first) * (self._total - self._done)
-            clock = f"{tqdm.format_interval(spent)}<{tqdm.format_interval(left)}"
-            print(
-                f"{self._phase} {100 * self._done / self._total:3.0f}% {clock}, {note}", file=self._stream, flush=True
-            )
+            left = spent / max(self._done - self._first, 1) * (self._total - self._done)
+            share = f"{100 * self._done / self._total:3.0f}%"
+            print(f"{self._phase} {share} {_clock(spent)}<{_clock(left)}, {note}", file=self._stream, flush=True)
+
+
+def _clock(seconds: float) -> str:
+    """Return a duration as minutes and seconds, "07:30", with hours in front where there are any."""
+    minutes, second = divmod(int(seconds), 60)
+    hour, minute = divmod(minutes, 60)
+    return (f"{hour}:" if hour else "") + f"{minute:02d}:{second:02d}"

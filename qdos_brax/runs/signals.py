@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: a run ends where it loses nothing, and says how to go on."""
+"""SIGINT and SIGTERM: a run stops where it loses nothing, and prints how to continue it."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 @contextlib.contextmanager
 def collected() -> Iterator[list[int]]:
-    """Collects the signals instead of dying of the first one; a second one kills."""
+    """Yield a list that collects the signals; a second one ends the process at once."""
     caught: list[int] = []
 
     def handle(number: int, frame: FrameType | None) -> None:
         caught.append(number)
         signal.signal(number, signal.SIG_DFL)
-        say("stopping after this chunk; once more stops at once")
+        warn("stopping after this chunk; a second signal stops at once")
 
     with _handled_by(handle):
         yield caught
@@ -29,13 +29,13 @@ def collected() -> Iterator[list[int]]:
 
 @contextlib.contextmanager
 def stops_at_once(path: Path) -> Iterator[None]:
-    """For what keeps nothing of its own under way (data, compilation, the report): the first signal ends it.
+    """End the program at the first signal, in work that has nothing to save (data, compilation, the report).
 
     Args:
-        path: of the run, which is named in the line that says how to go on.
+        path: the run's folder, for the line that tells how to continue it.
 
     Raises:
-        SystemExit: a signal came; the code is 130 or 143.
+        SystemExit: a signal arrived; the code is 130 or 143.
     """
     caught: list[int] = []
 
@@ -54,13 +54,19 @@ def stops_at_once(path: Path) -> Iterator[None]:
 
 
 def stop(number: int, how: str, path: Path) -> None:
-    """Ends the program with the code of a signal, and says how to go on."""
-    say(f"{how}; go on with: python train.py --resume {path}")
+    """End the program with the code of a signal, and print how to continue the run.
+
+    Args:
+        number: the signal.
+        how: first words of the line.
+        path: the run's folder.
+    """
+    warn(f"{how}; continue with: python train.py --resume {path}")
     raise SystemExit(128 + number) from None
 
 
-def say(line: str) -> None:
-    """A line to the user that is no result."""
+def warn(line: str) -> None:
+    """Print a line that is no result to stderr."""
     print(line, file=sys.stderr, flush=True)
 
 

@@ -1,4 +1,4 @@
-"""TensorBoard's event files: the numbers of metrics.csv once more, one folder per member."""
+"""TensorBoard's event files: the numbers of metrics.csv, one folder per member."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from qdos_brax.runs.metrics import Row, measured, step_of
 
 
 class TensorBoard:
-    """Writes the rows as scalars "phase/column", over environment steps online and over updates before.
+    """Write the rows as scalars "phase/column", over environment steps online and over updates before.
 
-    A run that goes on writes its files anew from the rows that it kept, so that no curve runs twice or ahead of the
-    run. TensorBoard's own ``purge_step`` would not do: it drops whatever has a larger step, and phases count apart.
+    A resumed run writes its files again from the rows that it kept, so that no curve shows a step twice or is ahead of
+    the run. TensorBoard's own ``purge_step`` would not do: it drops everything with a larger step, and phases count
+    separately.
 
     Args:
-        folder: of all members' files; what is in it is replaced.
-        members: what tells them apart; it names their folders.
+        folder: the folder of all members' files; its content is replaced.
+        members: the population; keys and values name the members' folders.
     """
 
     def __init__(self, folder: Path, members: Sequence[Mapping[str, Any]]) -> None:
@@ -33,7 +34,7 @@ class TensorBoard:
         self._writers: list[EventsWriter] = []
 
     def begin(self, rows: Sequence[Row]) -> None:
-        """Writes the rows so far."""
+        """Write the rows so far."""
         with user_errors(self._folder):
             if self._folder.exists():
                 shutil.rmtree(self._folder)
@@ -41,13 +42,13 @@ class TensorBoard:
                 member = self._folder / name
                 member.mkdir(parents=True)
                 writer = EventsWriter(str(member / "events"))
-                # Tells a TensorBoard that shows the run already to forget what it has read.
+                # Makes a TensorBoard that shows the run already forget what it has read.
                 writer.write_event(Event(wall_time=time.time(), session_log=SessionLog(status=SessionLog.START)))
                 self._writers.append(writer)
         self.append(rows)
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Writes new rows."""
+        """Write new rows."""
         now = time.time()
         with user_errors(self._folder):
             for row in rows:
@@ -61,6 +62,6 @@ class TensorBoard:
                 writer.flush()
 
     def end(self) -> None:
-        """Closes the files."""
+        """Close the files."""
         for writer in self._writers:
             writer.close()

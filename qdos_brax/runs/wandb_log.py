@@ -1,4 +1,4 @@
-"""Weights & Biases: the numbers of metrics.csv once more, one run of theirs per member, in a group."""
+"""Weights & Biases: the numbers of metrics.csv, one of its runs per member, in a group."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PROJECT = "qdos-brax"
 
 
 def load() -> Any:
-    """The package.
+    """Return the package wandb.
 
     Raises:
         UserError: it is not installed.
@@ -26,29 +26,33 @@ def load() -> Any:
         return importlib.import_module("wandb")
     except ImportError as error:
         raise UserError(
-            'wandb is not installed: pip install -c constraints.txt -e ".[wandb]" does it; or leave out --wandb '
-            "(a run that goes on: run.wandb in its config.yaml)"
+            'wandb is not installed: pip install -c constraints.txt -e ".[wandb]" installs it; or leave out --wandb '
+            "(for a resumed run: set run.wandb to false in its config.yaml)"
         ) from error
 
 
 class WandbLog:
-    """Logs a member's n-th row at step n, its numbers as "phase/column".
+    """Log a member's n-th row at step n, its numbers as "phase/column".
 
-    A run that is gone on with makes the same rows again after its checkpoint. Those that the server has already are
-    not sent twice: it says at which step it goes on.
+    A resumed run makes the same rows again after its checkpoint. Rows that the server has already are not sent again:
+    it reports the next step that it expects.
 
     Args:
-        folder: the run's folder; what names the run to the server is kept in it.
-        members: what tells the members apart.
+        folder: the run's folder; wandb.json in it keeps the run's name at the server.
+        members: the population.
     """
 
     def __init__(self, folder: RunFolder, members: Sequence[Mapping[str, Any]]) -> None:
         self._folder, self._members = folder, members
         self._runs: list[Any] = []
-        self._told = [0] * len(members)  # rows so far, by member
+        self._seen = [0] * len(members)  # rows so far, by member
 
     def begin(self, rows: Sequence[Row]) -> None:
-        """Opens the members' runs, and sends what the server lacks of the rows so far."""
+        """Open the members' runs, and send the rows so far that the server lacks.
+
+        Raises:
+            UserError: the server refuses.
+        """
         wandb, group = load(), self._group()
         try:
             for index, member in enumerate(self._members):
@@ -67,32 +71,32 @@ class WandbLog:
         except wandb.Error as error:
             reason = " ".join(str(error).split())
             raise UserError(
-                f"Weights & Biases does not take the run ({reason}); WANDB_MODE=offline keeps it here"
+                f"Weights & Biases refuses the run ({reason}); set WANDB_MODE=offline to keep it on this machine"
             ) from error
         self.append(rows)
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Sends new rows."""
+        """Send new rows."""
         for row in rows:
             index = int(row["member"])
-            run, number = self._runs[index], self._told[index]
-            self._told[index] += 1
+            run, number = self._runs[index], self._seen[index]
+            self._seen[index] += 1
             if number >= run.step:
                 values = {f"{row['phase']}/{name}": value for name, value in measured(row, self._members).items()}
                 run.log({"step": step_of(row), **values}, step=number, commit=True)
 
     def end(self) -> None:
-        """Closes the members' runs."""
+        """Close the members' runs."""
         for run in self._runs:
             run.finish()
 
     def _group(self) -> str:
-        """What the members' runs have in common: drawn once, for names at the server must be nobody else's."""
+        """Return the common part of the members' names: random, since names must be unique at the server, and kept."""
         if not self._folder.wandb.exists():
             write_text(self._folder.wandb, json.dumps({"group": uuid.uuid4().hex[:8]}) + "\n")
         try:
             return str(json.loads(self._folder.wandb.read_text(encoding="utf-8"))["group"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(
-                f"{self._folder.wandb} is damaged ({error!r}); remove it, and new runs begin there"
+                f"{self._folder.wandb} is damaged ({error!r}); remove it to start new runs there"
             ) from error

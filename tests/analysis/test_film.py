@@ -15,7 +15,7 @@ import pytest
 from envs import render
 from qdos_brax.analysis import film
 from qdos_brax.analysis import finished as finished_runs
-from qdos_brax.commands import cli
+from qdos_brax.commands import main as commands
 from qdos_brax.errors import UserError
 from qdos_brax.report.video import mp4
 
@@ -24,7 +24,7 @@ CAP = 25
 
 def main(command: str) -> int:
     try:
-        return cli.main(shlex.split(command))
+        return commands.main(shlex.split(command))
     except SystemExit as stop:
         return int(stop.code or 0)
 

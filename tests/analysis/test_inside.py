@@ -12,8 +12,8 @@ import pytest
 
 import envs
 from envs import render
+from qdos_brax.analysis import conclusion, inside
 from qdos_brax.analysis import finished as finished_runs
-from qdos_brax.analysis import inside
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
@@ -21,6 +21,7 @@ from qdos_brax.report.analysis_sections import analysis_sections
 from qdos_brax.report.member_analysis import read_analyses
 from qdos_brax.report.page import write_page
 from qdos_brax.report.study import read_study
+from qdos_brax.runs.folder import RunFolder
 
 CAP, HORIZON, SIZE = 25, 10, 60
 
@@ -49,16 +50,12 @@ def data() -> Dataset:
 
 @pytest.fixture
 def looked(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run that was looked into; its second segment is worth ten times as much as the others."""
-    (finished / "run.json").write_text(json.dumps({"dataset": {"path": "data.hdf5", "sha256": "d" * 64}}))
-    monkeypatch.setattr(inside.formats, "read", lambda path, env: data)
+    """An analysed run; its second segment is worth ten times as much as the others."""
     monkeypatch.setattr(inside, "_FRAME_HEIGHT", 48)
-    load = finished_runs.load_run
+    trained = finished_runs.load_run(finished)
     advantage = jnp.zeros((2, 33)).at[:, 1].set(math.log(10))
-    monkeypatch.setattr(
-        inside, "load_run", lambda run: load(run)._replace(artifacts=load(run).artifacts | {"advantage": advantage})
-    )
-    inside.look_inside(finished)
+    trained = trained._replace(artifacts=trained.artifacts | {"advantage": advantage})
+    inside.look_inside(trained, data, finished / "inside.npz")
     return finished
 
 
@@ -122,7 +119,15 @@ def opengl_or_not() -> bool:
 @pytest.mark.slow
 def test_without_provenance_it_is_one_line(finished: Path) -> None:
     with pytest.raises(UserError, match="which data the run had"):
-        inside.look_inside(finished)
+        conclusion.read_finished(RunFolder(finished))
+
+
+def test_a_finished_run_names_its_data(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    (finished / "run.json").write_text(json.dumps({"dataset": {"path": "data.hdf5", "sha256": "d" * 64}}))
+    read: list[Path] = []
+    monkeypatch.setattr(conclusion.formats, "read", lambda path, env: read.append(path) or data)
+    trained, dataset = conclusion.read_finished(RunFolder(finished))
+    assert read == [Path("data.hdf5")] and dataset is data and trained.config.seed == (0, 1)
 
 
 def test_grid_and_way_between_by_hand() -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from qdos_brax.commands import cli
+from qdos_brax.commands.main import main
+from qdos_brax.commands.train import train_main
 from qdos_brax.data import cache
 from qdos_brax.runs import comparison
 from tests.runs import toy
@@ -151,7 +152,7 @@ def content(root: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     ("main", "command"),
-    [*((cli.train_main, command) for command in TRAIN), *((cli.main, command) for command in OTHERS)],
+    [*((train_main, command) for command in TRAIN), *((main, command) for command in OTHERS)],
     ids=[*(f"train {command}" for command in TRAIN), *OTHERS],
 )
 def test_one_line_and_nothing_changed(

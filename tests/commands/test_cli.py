@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 import envs
-from qdos_brax.commands import cli
+from qdos_brax.commands.main import main
+from qdos_brax.commands.train import configs_from_args, train_main, train_parser
 from tests.runs import toy
 
 
 def run(command: str, train: bool = True) -> int:
     try:
-        return (cli.train_main if train else cli.main)(shlex.split(command))
+        return (train_main if train else main)(shlex.split(command))
     except SystemExit as stop:
         return int(stop.code or 0)
 
@@ -26,8 +29,16 @@ def test_every_flag_of_the_contract_has_help(capsys: pytest.CaptureFixture[str])
         assert f"{flag} " in text
     for flag in ("--steps", "--pretrain-steps", "--set"):
         assert f"{flag} " in text
-    for action in cli.train_parser()._actions:
+    for action in train_parser()._actions:
         assert action.help
+
+
+@pytest.mark.parametrize("call", ["train.train_parser()", "main.main_parser([])"])
+def test_help_waits_for_no_jax(call: str) -> None:
+    """It must answer at once; importing jax takes seconds."""
+    module = f"qdos_brax.commands.{call.split('.')[0]}"
+    code = f"import sys, {module}; qdos_brax.commands.{call}.format_help(); sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -59,7 +70,7 @@ def test_wrong_flags_are_one_line(
 def test_flags_reach_the_configuration() -> None:
     flags = "--env antsoccer --alpha 0.1,0.3 --seed 0,1 --method supe --preset smoke --physics mujoco --out o"
     more = "--dataset d.npz --steps 4000 --pretrain-steps 70 --set skills.kl_weight=0.2 --set eval.episodes=3"
-    (config,) = cli.configs_from_args(cli.train_parser().parse_args(shlex.split(f"{flags} {more}"))).values()
+    (config,) = configs_from_args(train_parser().parse_args(shlex.split(f"{flags} {more}"))).values()
     assert (config.env, config.method, config.preset, config.physics) == ("antsoccer", "supe", "smoke", "mujoco")
     assert (config.out, config.dataset, config.seed) == ("o", "d.npz", (0, 1))
     assert config.skills.alpha == (0.1, 0.3) and config.skills.kl_weight == 0.2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import envs
-from qdos_brax.commands.cli import main
+from qdos_brax.commands.main import main
 from qdos_brax.data import checks, formats
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError

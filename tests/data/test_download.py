@@ -17,7 +17,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from qdos_brax.commands.cli import main, train_main
+from qdos_brax.commands.main import main
+from qdos_brax.commands.train import train_main
 from qdos_brax.data import download, sources
 from qdos_brax.data.sources import Source
 from qdos_brax.errors import UserError
@@ -173,7 +174,7 @@ WHOLE = {f"{NAME}.npz", f"{NAME}.npz.json"}
 
 
 def test_a_fetched_file_is_recorded_and_not_fetched_again(server: Server, folder: Path) -> None:
-    path = download.fetch(server.source, folder, PATIENCE)
+    path, digest = download.fetch(server.source, folder, PATIENCE)
     assert path.read_bytes() == server.content and names(folder) == WHOLE
     record = json.loads((folder / f"{NAME}.npz.json").read_text())
     assert record == {
@@ -181,14 +182,14 @@ def test_a_fetched_file_is_recorded_and_not_fetched_again(server: Server, folder
         "sha256": hashlib.sha256(server.content).hexdigest(),
         "url": server.source.urls[0],
     }
-    assert download.fetch(server.source, folder, PATIENCE) == path and len(server.requests) == 1
+    assert download.fetch(server.source, folder, PATIENCE) == (path, digest) and len(server.requests) == 1
 
 
 @pytest.mark.parametrize("first", [broken, stalled])
 def test_a_broken_download_goes_on_where_it_was(server: Server, folder: Path, first: Answer) -> None:
     server.answers = [first, honest]
     started = time.monotonic()
-    assert download.fetch(server.source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(server.source, folder, PATIENCE).path.read_bytes() == server.content
     assert [span for _, span in server.requests] == [None, f"bytes={HALF}-"]
     assert names(folder) == WHOLE and time.monotonic() - started < 10
 
@@ -199,7 +200,7 @@ def test_a_later_process_goes_on_too(server: Server, folder: Path) -> None:
         download.fetch(server.source, folder, PATIENCE)
     assert (folder / f"{NAME}.npz.part").stat().st_size == HALF
     server.answers, server.requests = [honest], []
-    assert download.fetch(server.source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(server.source, folder, PATIENCE).path.read_bytes() == server.content
     assert server.requests[0][1] == f"bytes={HALF}-"
 
 
@@ -209,12 +210,12 @@ def test_a_file_that_changed_meanwhile_is_not_patched_together(server: Server, f
         download.fetch(server.source, folder, PATIENCE)
     server.content = npz(tmp_path / "changed.npz", seed=1)
     server.answers = [honest]
-    assert download.fetch(server.source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(server.source, folder, PATIENCE).path.read_bytes() == server.content
 
 
 def test_a_server_without_ranges_starts_over(server: Server, folder: Path) -> None:
     server.answers = [without_ranges_broken, without_ranges]
-    assert download.fetch(server.source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(server.source, folder, PATIENCE).path.read_bytes() == server.content
     server.answers, server.requests = [without_ranges_broken], []
     (folder / f"{NAME}.npz").unlink()
     with pytest.raises(UserError, match=f"truncated at {HALF:,} of {len(server.content):,} bytes"):
@@ -227,7 +228,7 @@ def test_a_server_without_ranges_starts_over(server: Server, folder: Path) -> No
     [
         (too_short_a_length, "not a data file, or only a part"),
         (too_long_a_length, "truncated at"),
-        (another_range, "goes on elsewhere than asked"),
+        (another_range, "continues elsewhere than asked"),
         (a_page, "not a data file, or only a part"),
         (refusing(404), "404 Not Found"),
     ],
@@ -239,24 +240,24 @@ def test_lies_leave_no_file_and_say_why(server: Server, folder: Path, lie: Answe
     assert f"{NAME}.npz" not in names(folder) and "\n" not in str(error.value)
     assert len(server.requests) < 10
     server.answers = [honest]
-    assert download.fetch(server.source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(server.source, folder, PATIENCE).path.read_bytes() == server.content
 
 
 def test_a_size_need_not_be_told(server: Server, folder: Path) -> None:
     server.answers = [no_length]
-    assert download.fetch(server.source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(server.source, folder, PATIENCE).path.read_bytes() == server.content
 
 
 def test_the_mirror_helps_out(server: Server, folder: Path) -> None:
     server.answers = [refusing(404), honest]
     original = server.source.urls[0]
     source = Source(NAME, f"{NAME}.npz", (original, original.replace("original", "mirror")))
-    assert download.fetch(source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(source, folder, PATIENCE).path.read_bytes() == server.content
     assert [path.split("/")[1] for path, _ in server.requests] == ["original", "mirror"]
 
 
 def test_what_was_fetched_is_checked_ever_after(server: Server, folder: Path, tmp_path: Path) -> None:
-    path = download.fetch(server.source, folder, PATIENCE)
+    path = download.fetch(server.source, folder, PATIENCE).path
     content = bytearray(server.content)
     content[1000] ^= 1
     path.write_bytes(content)
@@ -268,7 +269,7 @@ def test_what_was_fetched_is_checked_ever_after(server: Server, folder: Path, tm
         download.fetch(server.source, folder, PATIENCE)
     assert not path.exists()
     (folder / f"{NAME}.npz.json").unlink()
-    assert download.fetch(server.source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(server.source, folder, PATIENCE).path.read_bytes() == server.content
 
 
 def test_offline_is_one_line(folder: Path) -> None:
@@ -296,7 +297,7 @@ def test_a_full_disk_is_one_line_and_keeps_what_is_there(
         with pytest.raises(UserError, match=r"No space left on device\); free some space"):
             download.fetch(server.source, folder, PATIENCE)
     server.requests.clear()
-    assert download.fetch(server.source, folder, PATIENCE).read_bytes() == server.content
+    assert download.fetch(server.source, folder, PATIENCE).path.read_bytes() == server.content
     assert server.requests == []  # it was all there
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from qdos_brax import config as configs
 from qdos_brax.analysis.finished import evaluate_run
-from qdos_brax.commands.cli import train_main
+from qdos_brax.commands.train import train_main
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.methods import settings as recipe_settings
 from qdos_brax.data.device import to_device

@@ -16,7 +16,7 @@ import pytest
 
 from qdos_brax.population import memory
 from qdos_brax.population.members import Population
-from qdos_brax.runs import parts
+from qdos_brax.runs import shares
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import read_rows
 from tests.runs.program import free_port
@@ -159,17 +159,17 @@ def test_a_plan_fills_an_accelerator() -> None:
 
 def test_shares_are_blocks_and_cover_everyone() -> None:
     members = list(range(7))
-    shares = [parts.share_of(members, index, 3) for index in range(3)]
-    assert shares == [[0, 1, 2], [3, 4], [5, 6]]
+    blocks = [shares.members_of(members, index, 3) for index in range(3)]
+    assert blocks == [[0, 1, 2], [3, 4], [5, 6]]
 
 
 def test_a_process_that_stopped_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = RunFolder.create(tmp_path / "run")
-    parts.create(folder, 2, "env: antmaze-medium-task1\n")
-    assert [part.path.name for part in parts.parts_of(folder)] == ["0", "1"]
-    monkeypatch.setattr(parts, "_PATIENCE", 0.0)
-    with pytest.raises(parts.UserError, match="has stopped before its end"):
-        parts.await_end(parts.parts_of(folder)[1])
+    shares.create(folder, 2, "env: antmaze-medium-task1\n")
+    assert [share.path.name for share in shares.shares_of(folder)] == ["0", "1"]
+    monkeypatch.setattr(shares, "_PATIENCE", 0.0)
+    with pytest.raises(shares.UserError, match="has stopped before its end"):
+        shares.await_end(shares.shares_of(folder)[1])
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qdos_brax.commands import cli
+from qdos_brax.commands import main as commands
 from qdos_brax.report.series import curves, scans, surfaces
 from qdos_brax.report.study import read_study
 from qdos_brax.report.summary_cards import summary_cards
@@ -228,7 +228,7 @@ def test_what_cannot_be_reported_is_one_line(
         case "file in the way":
             out.touch()
     try:
-        code = cli.main(["report", *arguments, "--out", str(out)])
+        code = commands.main(["report", *arguments, "--out", str(out)])
     except SystemExit as stop:
         code = int(stop.code or 0)
     lines = capsys.readouterr().err.strip().splitlines()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import write_text
+from qdos_brax.files import is_partial, replacing_folder, write_text
 from qdos_brax.runs import signals
 from qdos_brax.runs.folder import RunFolder, new_path
 
@@ -33,7 +33,7 @@ def test_a_run_is_not_overwritten(tmp_path: Path) -> None:
     folder = made(tmp_path / "run")
     RunFolder.create(folder.path)  # nothing was trained in it yet
     write_text(folder.metrics, "member,seed\n")
-    with pytest.raises(UserError, match="holds a run already; go on with --resume"):
+    with pytest.raises(UserError, match="holds a run already; continue with --resume"):
         RunFolder.create(tmp_path / "run")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").touch()
@@ -62,6 +62,19 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
     assert target.read_text() == "old"
 
 
+def test_a_folder_is_replaced_when_it_is_complete_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "made"
+    for word in ("first", "second"):
+        with replacing_folder(path) as partial:
+            assert is_partial(partial) and partial.parent == tmp_path
+            (partial / word).touch()
+        assert [file.name for file in path.iterdir()] == [word]
+    with pytest.raises(UserError, match="No space left on device; free some space"), replacing_folder(path) as partial:
+        (partial / "third").touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert list(tmp_path.iterdir()) == [path] and [file.name for file in path.iterdir()] == ["second"]
+
+
 def test_new_path_never_repeats(tmp_path: Path) -> None:
     first = new_path(tmp_path, "a")
     first.mkdir()
@@ -87,4 +100,4 @@ def test_a_signal_outside_the_phases_says_how_to_go_on(
             raise RuntimeError("INTERNAL: callback") from error
     assert stopped.value.code == code and signal.getsignal(number) is before
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == f"stopped; go on with: python train.py --resume {tmp_path}"
+    assert line == f"stopped; continue with: python train.py --resume {tmp_path}"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from qdos_brax.commands.cli import train_main
+from qdos_brax.commands.train import train_main
 from tests.runs.program import assert_same_end, launch, place, rows, wait_for_start
 
 # A save after every chunk, so that a kill lands between two checkpoints or in the middle of one.

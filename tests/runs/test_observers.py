@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-from qdos_brax.commands import cli
+from qdos_brax.commands import train as train_command
 from qdos_brax.errors import UserError
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.live import MemberBoard
@@ -137,7 +137,7 @@ def test_wandb_refusing_is_one_line(tmp_path: Path, server: Any, monkeypatch: py
         raise sys.modules["wandb"].Error("no API key\nconfigured")
 
     monkeypatch.setattr(sys.modules["wandb"], "init", refuse)
-    with pytest.raises(UserError, match=r"does not take the run \(no API key configured\); WANDB_MODE=offline"):
+    with pytest.raises(UserError, match=r"refuses the run \(no API key configured\); set WANDB_MODE=offline"):
         toy.run(tmp_path / "run", observers=[WandbLog(RunFolder(tmp_path / "run"), toy.MEMBERS)])
 
 
@@ -146,7 +146,7 @@ def test_wandb_that_is_not_installed_is_one_line_and_nothing_starts(
 ) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     flags = ["--env", "antmaze-medium", "--preset", "smoke", "--wandb", "--out", str(tmp_path / "run")]
-    assert cli.train_main(flags) == 2
+    assert train_command.train_main(flags) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: wandb is not installed") and not (tmp_path / "run").exists()
 
@@ -194,3 +194,17 @@ def test_elsewhere_it_is_quiet(board: tuple[MemberBoard, MetricsTable]) -> None:
             progress.advance(10.0, "env steps", math.nan)
     (line,) = stream.getvalue().splitlines()
     assert line.startswith("online 100%") and line.endswith("10 env steps/s")
+
+
+def test_amounts_are_shown_with_mean_rate_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 20.0, 20.0, 25.0, 25.0, 4000.0, 4000.0])
+    monkeypatch.setattr("qdos_brax.runs.progress.time.monotonic", lambda: next(clock))
+    stream = io.StringIO()
+    with Progress("collect", 1000, stream=stream) as progress:
+        progress.advance_to(200, "steps")
+        progress.advance_to(300, "steps")  # within ten seconds of the line before
+        progress.advance_to(1000, "steps")
+    assert stream.getvalue().splitlines() == [
+        "collect  20% 00:20<01:20, 10 steps/s",
+        "collect 100% 1:06:40<00:00, 0 steps/s",
+    ]

@@ -154,7 +154,7 @@ def test_truncated_newest_checkpoint_falls_back(
     phases = toy.phases()
     toy.run(path, phases)
     line = next(line for line in capsys.readouterr().err.splitlines() if "cannot be used" in line)
-    assert newest in line and "truncated" in line and f"going on from {older}" in line
+    assert newest in line and "truncated" in line and f"continuing from {older}" in line
     assert phases[2].chunks_run == 3
     assert_same_end(path, whole)
 

@@ -121,14 +121,14 @@ def run(
     checkpoint_seconds: float = 0.0,
     observers: Sequence[Observer] = (),
 ) -> dict[str, Any]:
-    """Runs the toy in ``path``, or goes on with it."""
+    """Run the toy in ``path``, or continue it; return its summary."""
     if path.exists():
         folder = RunFolder.open(path)
     else:
         folder = RunFolder.create(path)
         folder.config.write_text("env: antmaze-medium-task1\n", encoding="utf-8")
     with folder.held():
-        return run_phases(
+        summary, _ = run_phases(
             toy_phases or phases(),
             folder,
             MEMBERS,
@@ -138,6 +138,7 @@ def run(
             data_seconds=0.5,
             observers=observers,
         )
+    return summary
 
 
 if __name__ == "__main__":

@@ -1,0 +1,81 @@
+"""The end of a run: its analysis, its report, and the last lines on the terminal."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from qdos_brax.analysis.finished import TrainedRun, load_run
+from qdos_brax.config.methods import METHODS
+from qdos_brax.data import formats
+from qdos_brax.data.dataset import Dataset
+from qdos_brax.errors import UserError
+from qdos_brax.report.write import Report, write_report
+from qdos_brax.runs.folder import RunFolder
+
+
+def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[], tuple[TrainedRun, Dataset]]) -> None:
+    """Analyse a run, write the report, and print the last lines: results and files.
+
+    Args:
+        folder: the run's folder.
+        summary: its summary.
+        finished: returns what the run learned, and its data; called only if there is no analysis yet.
+    """
+    if not folder.inside.exists():
+        from qdos_brax.analysis.inside import look_inside  # here, because scikit-learn takes its time
+
+        try:
+            look_inside(*finished(), folder.inside)
+        except Exception as error:  # whatever it is: the run is done, and the page does without
+            print(f"inside    left out: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr, flush=True)
+    report = write_report([folder.path], folder.path)
+    print(f"\ndone in {summary['wall_seconds']['total'] / 60:.1f} minutes")
+    for member in summary["members"]:
+        print(f"  {with_alpha(summary['method'], member['alpha'])}seed {member['seed']}: {_result(member)}")
+    print(f"summary   {folder.summary}")
+    print_files(report)
+    print(f"evaluate  python -m qdos_brax evaluate {folder.path}", flush=True)
+
+
+def _result(member: Mapping[str, Any]) -> str:
+    success, first = member["eval_success"], member["first_goal_step"]
+    result = "not evaluated" if success is None else f"success {success:.2f} (best {member['best_success']:.2f})"
+    if first is not None:
+        result += f", first goal after {first:,} env steps"
+    elif not member["best_success"]:  # an offline method reaches goals without a step online
+        result += ", no goal reached"
+    return result + ("" if member["status"] == "ok" else ", FROZEN: its numbers were no longer finite")
+
+
+def read_finished(folder: RunFolder) -> tuple[TrainedRun, Dataset]:
+    """Read what a finished run learned, and its data, from its folder.
+
+    Raises:
+        UserError: the run has not finished, or the folder or the data are gone or damaged.
+    """
+    trained = load_run(folder.path)
+    try:
+        path = Path(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["path"])
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"cannot read from {folder.provenance} which data the run had ({error})") from error
+    return trained, formats.read(path, trained.env)
+
+
+def print_files(report: Report) -> None:
+    """Print where the page and the curves are."""
+    print(f"report    {report.page}")
+    print(f"curves    {report.curves}", flush=True)
+
+
+def with_alpha(method: str, alpha: Any) -> str:
+    """Return "alpha A, " for methods with the mutual-information term, which it weighs; nothing for the others."""
+    return f"alpha {listed(alpha)}, " if METHODS[method].information else ""
+
+
+def listed(values: Any) -> str:
+    """Return one number, or several separated by commas."""
+    return ", ".join(f"{value:g}" for value in (values if isinstance(values, tuple) else (values,)))

@@ -1,0 +1,82 @@
+"""What all command lines share: a parser, types of numbers, and one clear line for an error."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from qdos_brax.config import nearest
+from qdos_brax.errors import UserError
+
+
+class Parser(argparse.ArgumentParser):
+    """Parse arguments with errors of one line, and without abbreviated flags."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**{"allow_abbrev": False, **kwargs})
+
+    def error(self, message: str) -> NoReturn:
+        """Print the line and exit with code 2."""
+        self.exit(2, f"error: {message} (see {self.prog} --help)\n")
+
+
+def parse(parser: Parser, argv: Sequence[str]) -> argparse.Namespace:
+    """Return the parsed arguments; for an unknown one, exit with the nearest flag in the message."""
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        word = unknown[0].partition("=")[0]
+        parser.error(f"unknown argument {unknown[0]}{nearest(word, _flags(parser))}")
+    return args
+
+
+def _flags(parser: argparse.ArgumentParser) -> list[str]:
+    """Return the long flags of a parser and of its commands."""
+    flags = [name for action in parser._actions for name in action.option_strings if name.startswith("--")]
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            flags += [name for command in action.choices.values() for name in _flags(command)]
+    return flags
+
+
+def positive(text: str) -> int:
+    """Return a whole number from 1; the type of an argument."""
+    number = int(text) if text.isdigit() else 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1, not {text!r}")
+    return number
+
+
+def natural(text: str) -> int:
+    """Return a whole number from 0; the type of an argument."""
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0, not {text!r}")
+    return int(text)
+
+
+def guarded(work: Callable[[], int | None]) -> int:
+    """Return the exit code of ``work``; for a UserError print one line and return 2."""
+    try:
+        return work() or 0
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if not _is_from_opengl(error):
+            raise
+        asked = os.environ.get("MUJOCO_GL")
+        print(f"error: MUJOCO_GL is {asked!r}, which MuJoCo cannot load here ({error}); unset it", file=sys.stderr)
+        return 2
+
+
+def _is_from_opengl(error: Exception) -> bool:
+    """Return whether ``import mujoco`` failed at the OpenGL library that MUJOCO_GL names; only pictures need one."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return "MUJOCO_GL" in os.environ and any(Path(frame.filename).name == "gl_context.py" for frame in frames)

@@ -1,0 +1,136 @@
+"""The commands of ``python -m qdos_brax``: data, evaluate, report, picture, tasks, doctor."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from qdos_brax import __version__
+from qdos_brax.commands.arguments import Parser, guarded, parse, positive
+from qdos_brax.errors import UserError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``python -m qdos_brax``; return the exit code."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    args = parse(main_parser(argv), argv)
+    return guarded(lambda: args.run(args))
+
+
+def main_parser(argv: Sequence[str]) -> Parser:
+    """Return the parser of ``python -m qdos_brax``; the actions of ``data`` only if ``argv`` asks for them."""
+    parser = Parser(
+        prog="python -m qdos_brax", description="Data, evaluation, reports, pictures, a check of this machine."
+    )
+    parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    if argv[:1] == ["data"]:
+        from qdos_brax.commands.data import add_parser  # imports jax and h5py, which the others need not wait for
+
+        add_parser(commands)
+    else:
+        commands.add_parser("data", help="make, fetch, describe and check data files")
+
+    evaluate = commands.add_parser("evaluate", help="evaluate the policy of a run")
+    evaluate.add_argument("runs", metavar="RUN", nargs="+", help="a run folder")
+    evaluate.add_argument("--episodes", metavar="N", type=positive, default=20, help="episodes per member (default 20)")
+    evaluate.add_argument(
+        "--video", metavar="FILE", help="also film the first member's first episode, as .mp4; takes one RUN"
+    )
+    evaluate.set_defaults(run=_evaluate)
+
+    report = commands.add_parser("report", help="tables, learning curves and a page of runs")
+    report.add_argument("runs", metavar="RUN", nargs="+", help="the folder of a finished run or comparison")
+    report.add_argument(
+        "--out", metavar="DIR", help="the folder for the files (default: that of a single RUN, else report/)"
+    )
+    report.add_argument(
+        "--reference",
+        metavar="METHOD",
+        help="the method to compare the others with (default supe, else the first)",
+    )
+    report.set_defaults(run=_report)
+
+    picture = commands.add_parser("picture", help="draw a task at its start")
+    picture.add_argument("task", metavar="TASK", help="a task, as listed by: python -m qdos_brax tasks")
+    picture.add_argument("--out", metavar="FILE", required=True, help="the picture to write, as .png")
+    picture.set_defaults(run=_picture)
+
+    tasks = commands.add_parser("tasks", help="list the tasks and their aliases")
+    tasks.set_defaults(run=_tasks)
+
+    doctor = commands.add_parser("doctor", help="check versions, devices, caches and callbacks of this machine")
+    doctor.set_defaults(run=_doctor)
+    return parser
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    if args.video and len(args.runs) > 1:
+        raise UserError(f"--video films one run, and {len(args.runs)} were given; name one RUN")
+
+    from qdos_brax.analysis.finished import evaluate_run
+    from qdos_brax.runs.jax_setup import prepare_jax
+
+    prepare_jax()
+    if args.video:
+        from qdos_brax.analysis.film import film_run
+
+        episode = film_run(Path(args.runs[0]), Path(args.video))
+        print(f"{args.video}: " + ", ".join(f"{name} {value:g}" for name, value in episode.items()), flush=True)
+    for run in args.runs:
+        for member in evaluate_run(Path(run), args.episodes):
+            print(f"{run}: " + ", ".join(f"{name} {value:g}" for name, value in member.items()))
+    return 0
+
+
+def _report(args: argparse.Namespace) -> int:
+    from qdos_brax.report.write import write_report
+
+    runs = [Path(run) for run in args.runs]
+    out = Path(args.out) if args.out else runs[0] if len(runs) == 1 else Path("report")
+    report = write_report(runs, out, args.reference)
+    print(f"{report.text}\n")
+    for file in report.files:
+        print(file)
+    return 0
+
+
+def _picture(args: argparse.Namespace) -> int:
+    from qdos_brax.report.picture import draw_task
+
+    draw_task(args.task, Path(args.out))
+    print(args.out)
+    return 0
+
+
+def _tasks(args: argparse.Namespace) -> int:
+    import envs
+
+    aliases = {target: alias for alias, target in envs.ALIASES.items()}
+    counts = Counter(spec.name for spec in envs.list_tasks())
+    rows = [["task", "observation", "action", "cap", "engines", "variants", "default", "alias"]]
+    for name, count in counts.items():
+        default = envs.get_spec(name)
+        family = envs.FAMILIES[default.family]
+        variant = family.variants[default.variant]
+        sizes = map(str, (variant.observation_size, variant.action_size, variant.episode_length))
+        variants = [f"task1 to task{count}", f"task{default.task_id}", aliases.get(name, "")]
+        rows.append([name, *sizes, ", ".join(family.engines), *variants])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (
+            text.rjust(width) if column in (1, 2, 3) else text.ljust(width)  # numbers to the right
+            for column, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        print("  ".join(cells).rstrip())
+    print("\nmjx-warp runs on CUDA only. Run `python -m qdos_brax doctor` to see which engines work here.")
+    return 0
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from qdos_brax.commands.doctor import examine
+
+    return 0 if examine() else 1
