@@ -51,7 +51,7 @@ from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
 
 
-class Sizes(Protocol):
+class SpaceSizes(Protocol):
     """Give the sizes of a task's observations and actions; every environment does."""
 
     observation_size: int
@@ -142,7 +142,7 @@ def bind_phases(phases: Sequence[MemberPhase], population: Population, data: Dev
         phase.bind(population, shared)
 
 
-def make_low_level(config: Config, env: Sizes) -> LowLevelPolicy:
+def make_low_level(config: Config, env: SpaceSizes) -> LowLevelPolicy:
     """Return the method's low-level policy; its parameters are what its phases learn."""
     return _LOW_LEVEL[METHODS[config.method].source].make(config, env)
 
@@ -150,16 +150,16 @@ def make_low_level(config: Config, env: Sizes) -> LowLevelPolicy:
 class _LowLevelKind(NamedTuple):
     """A kind of low-level policy: how it is made, and the phases that learn it."""
 
-    make: Callable[[Config, Sizes], LowLevelPolicy]
+    make: Callable[[Config, SpaceSizes], LowLevelPolicy]
     phases: Callable[[BuildContext], list[MemberPhase]]
 
 
-def make_skill_model(config: Config, env: Sizes) -> SkillModel:
+def make_skill_model(config: Config, env: SpaceSizes) -> SkillModel:
     """Return the trajectory VAE of a configuration."""
     return SkillModel(env.observation_size, env.action_size, config.skills)
 
 
-def _trajectory_skills(config: Config, env: Sizes) -> LowLevelPolicy:
+def _trajectory_skills(config: Config, env: SpaceSizes) -> LowLevelPolicy:
     return TrajectorySkills(make_skill_model(config, env), config.high_level.latent_map)
 
 
@@ -174,11 +174,11 @@ def _trajectory_phases(context: BuildContext) -> list[MemberPhase]:
     return [value_phase(config, context.env, context.dataset.ends), skills] if method.weighted else [skills]
 
 
-def _hilbert(config: Config, env: Sizes) -> Hilbert:
+def _hilbert(config: Config, env: SpaceSizes) -> Hilbert:
     return Hilbert(env.observation_size, env.action_size, config.skills.latent_dim, config.hilbert)
 
 
-def _direction_skills(config: Config, env: Sizes) -> LowLevelPolicy:
+def _direction_skills(config: Config, env: SpaceSizes) -> LowLevelPolicy:
     learner = _hilbert(config, env)
     return DirectionSkills(learner.latent_dim, learner.direction, learner.act)
 
@@ -188,11 +188,11 @@ def _direction_phases(context: BuildContext) -> list[MemberPhase]:
     return [_offline_phase(context, "skills", learner, context.config.hilbert.updates)]
 
 
-def _diveoff(config: Config, env: Sizes) -> DiveOff:
+def _diveoff(config: Config, env: SpaceSizes) -> DiveOff:
     return DiveOff(env.observation_size, env.action_size, config.skills.latent_dim, config.diveoff)
 
 
-def _transition_skills(config: Config, env: Sizes) -> LowLevelPolicy:
+def _transition_skills(config: Config, env: SpaceSizes) -> LowLevelPolicy:
     learner = _diveoff(config, env)
     return TransitionSkills(learner, learner.encode, config.high_level.latent_map)
 
@@ -202,7 +202,7 @@ def _transition_phases(context: BuildContext) -> list[MemberPhase]:
     return [_offline_phase(context, "skills", learner, context.config.diveoff.updates)]
 
 
-def _primitive_actions(config: Config, env: Sizes) -> LowLevelPolicy:
+def _primitive_actions(config: Config, env: SpaceSizes) -> LowLevelPolicy:
     if config.skills.horizon != 1:
         raise UserError(
             f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, "
@@ -232,7 +232,7 @@ class _Guide(NamedTuple):
     jump_start: JumpStart
 
 
-def _diffusion_guide(config: Config, env: Sizes) -> _Guide:
+def _diffusion_guide(config: Config, env: SpaceSizes) -> _Guide:
     learner = DiffusionBC(env.observation_size, env.action_size, config.guide)
     return _Guide(learner, JumpStart(learner.sample, config.guide.ratio, config.guide.persistence))
 
@@ -240,11 +240,11 @@ def _diffusion_guide(config: Config, env: Sizes) -> _Guide:
 _GUIDES = {"diffusion": _diffusion_guide}
 
 
-def _bc(config: Config, env: Sizes) -> PolicyLearner:
+def _bc(config: Config, env: SpaceSizes) -> PolicyLearner:
     return BC(env.observation_size, env.action_size, config.policy)
 
 
-def _iql(config: Config, env: Sizes) -> PolicyLearner:
+def _iql(config: Config, env: SpaceSizes) -> PolicyLearner:
     values = IQL(env.observation_size, env.action_size, config.values.hidden)
     return IQLPolicy(env.observation_size, env.action_size, config.policy, values)
 
@@ -252,7 +252,7 @@ def _iql(config: Config, env: Sizes) -> PolicyLearner:
 _POLICIES = {"bc": _bc, "iql": _iql}
 
 
-def make_policy(config: Config, env: Sizes, name: str) -> PolicyLearner:
+def make_policy(config: Config, env: SpaceSizes, name: str) -> PolicyLearner:
     """Return the learner of the flat policy called ``name``, a method's ``policy``."""
     return _POLICIES[name](config, env)
 
@@ -270,7 +270,7 @@ def _policy_phase(context: BuildContext, name: str) -> OfflinePhase:
     return _offline_phase(context, "policy", learner, config.policy.updates, evaluation)
 
 
-def value_phase(config: Config, env: Sizes, ends: np.ndarray) -> GraphPhase | ValuePhase:
+def value_phase(config: Config, env: SpaceSizes, ends: np.ndarray) -> GraphPhase | ValuePhase:
     """Return the phase that finds the segments' advantages, by ``config.values.estimator``.
 
     Args:
@@ -283,7 +283,7 @@ def value_phase(config: Config, env: Sizes, ends: np.ndarray) -> GraphPhase | Va
     return ValuePhase(config, IQL(env.observation_size, env.action_size, config.values.hidden))
 
 
-def _weights(config: Config, method: Recipe, env: Sizes) -> SegmentWeights:
+def _weights(config: Config, method: Recipe, env: SpaceSizes) -> SegmentWeights:
     if not method.weighted:
         return UniformWeights()
     if config.skills.advantage != "latent":
@@ -311,7 +311,7 @@ def _labeller(context: BuildContext, low_level: LowLevelPolicy) -> OfflineReward
     return MinimumReward(model, context.config.skills.horizon, float(context.dataset.rewards.min()))
 
 
-def _bonus(config: Config, env: Sizes, low_level: LowLevelPolicy) -> Bonus:
+def _bonus(config: Config, env: SpaceSizes, low_level: LowLevelPolicy) -> Bonus:
     labels = config.labels
     if labels.rnd_coefficient == 0:
         return NoBonus()
