@@ -149,7 +149,6 @@ class Task(Env, ABC):
         obs = self.observe(pipeline_state)
         info = {
             "goal": jnp.asarray(self._goal if goal is None else goal, jnp.float32),
-            "steps": jnp.zeros((), jnp.int32),
             "truncation": jnp.zeros(()),
             "final_obs": obs,
             "reset_key": jax.random.key(0) if key is None else key,
@@ -163,15 +162,14 @@ class Task(Env, ABC):
         reward, mask = self.labels(before, goal)
         pipeline_state = self.engine.step(before, action)
         obs = self.observe(pipeline_state)
-        steps = state.info["steps"] + 1
-        capped = (steps >= self.episode_length).astype(jnp.float32)
+        capped = (pipeline_state.steps >= self.episode_length).astype(jnp.float32)
         return state.replace(
             pipeline_state=pipeline_state,
             obs=obs,
             reward=reward,
             done=jnp.maximum(1.0 - mask, capped),
             metrics=state.metrics | {"success": success},
-            info=state.info | {"steps": steps, "truncation": capped * mask, "final_obs": obs},
+            info=state.info | {"truncation": capped * mask, "final_obs": obs},
         )
 
     def observe(self, pipeline_state: PipelineState) -> jax.Array:

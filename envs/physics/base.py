@@ -21,6 +21,8 @@ class PipelineState(struct.PyTreeNode):
         sensed: float32[k], what the task observes besides qpos and qvel, of this very state; k is 0 for most tasks.
         extra: int32[e], discrete state that the physics does not know, such as buttons; e is 0 for most tasks.
         carry: whatever the engine needs to go on exactly as if it had never stopped (warm start, float64 bits).
+        steps: int32, control steps since ``init``. They are counted here and not in ``State.info``, where Brax's own
+            wrappers keep a count of theirs, and a wrapper that puts an earlier state back puts its count back too.
     """
 
     qpos: jax.Array
@@ -28,6 +30,7 @@ class PipelineState(struct.PyTreeNode):
     sensed: jax.Array
     extra: jax.Array
     carry: Any
+    steps: jax.Array
 
 
 @dataclass(frozen=True)

@@ -158,7 +158,7 @@ class Hilbert:
         return jnp.mean(jnp.sum(weight * error**2, axis=0))
 
     def skill_batch(self, phi: Params, batch: GoalBatch, latent: jax.Array, discount: jax.Array | float) -> ValueBatch:
-        """Return the transitions as skills z = ``latent``[B, d] see them: never ending, reward <phi(s') - phi(s), z>."""
+        """Return the transitions as skills z = ``latent``[B, d] see them: endless, reward <phi(s') - phi(s), z>."""
         moved = self._first(phi, batch.next_observation) - self._first(phi, batch.observation)
         return ValueBatch(
             observation=jnp.concatenate([batch.observation, latent], axis=-1),
@@ -171,7 +171,7 @@ class Hilbert:
     def step(
         self, state: HilbertState, batch: GoalBatch, latent: jax.Array, hyper: HilbertHyper
     ) -> tuple[HilbertState, dict[str, jax.Array]]:
-        """Make one step of phi and its target on ``batch``, and one of the skills ``latent``[B, d] on its transitions."""
+        """Make one step of phi and its target on ``batch``, and one of the skills ``latent``[B, d] on it."""
         loss, grads = jax.value_and_grad(self.distance_loss)(state.phi, state.target_phi, batch, hyper)
         phi, opt_state = adam_step(state.phi, state.phi_opt_state, grads, hyper.learning_rate)
         target_phi = polyak(state.target_phi, phi, hyper.target_rate)

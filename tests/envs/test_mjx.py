@@ -73,7 +73,7 @@ def test_mjx_task_runs_and_resets_in_jit() -> None:
     env = envs.AutoReset(envs.make("antmaze-medium", physics="mjx"))
     assert env.backend == "mjx"
     state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 4))
-    state.info["steps"] = jnp.array([0, 0, 997, 999])
+    state = state.replace(pipeline_state=state.pipeline_state.replace(steps=jnp.array([0, 0, 997, 999])))
 
     def body(state: Any, key: jax.Array) -> tuple[Any, Any]:
         after = jax.vmap(env.step)(state, jax.random.uniform(key, (4, 8), minval=-1, maxval=1))
@@ -81,6 +81,6 @@ def test_mjx_task_runs_and_resets_in_jit() -> None:
 
     last, done = jax.jit(lambda s, k: jax.lax.scan(body, s, k))(state, jax.random.split(jax.random.key(1), 5))
     assert jax.tree.structure(last) == jax.tree.structure(state)
-    np.testing.assert_array_equal(last.info["steps"], [5, 5, 2, 4])
+    np.testing.assert_array_equal(last.pipeline_state.steps, [5, 5, 2, 4])
     np.testing.assert_array_equal(done.sum(axis=0), [0, 0, 1, 1])
     assert bool(jnp.isfinite(last.obs).all()) and float(last.metrics["nan"].sum()) == 0

@@ -47,7 +47,7 @@ def test_rollouts_equal_ogbench_bit_for_bit(name: str) -> None:
         used = env.episode_length - STEPS if kind == "task" else 0  # the cap falls on the last step
         expected = ogbench_rollout(reference, qpos, qvel, actions, steps_done=used)
         state = env.reset_to(qpos, qvel, env.goal_xy)
-        state.info["steps"] = jnp.int32(used)
+        state = state.replace(pipeline_state=state.pipeline_state.replace(steps=jnp.int32(used)))
         states = our_rollout(env, state, actions)
 
         exact = np.concatenate(env.engine.exact_state(states.pipeline_state), axis=-1)

@@ -38,7 +38,7 @@ def test_every_task_resets_and_steps(spec: envs.TaskSpec) -> None:
     assert after.obs.shape == (2, obs_size) and bool(jnp.isfinite(after.obs).all())
     np.testing.assert_array_equal(after.reward, [-1, -1])
     np.testing.assert_array_equal(after.done, [0, 0])
-    np.testing.assert_array_equal(after.info["steps"], [1, 1])
+    np.testing.assert_array_equal(after.pipeline_state.steps, [1, 1])
     distance = env.distance_left(np.asarray(before.pipeline_state.qpos))
     assert (distance > 1.5).all() and np.isfinite(distance).all()
     same = np.flatnonzero(before.pipeline_state.qpos[0] == before.pipeline_state.qpos[1])
@@ -129,7 +129,7 @@ def test_reset_to_takes_any_state_and_goal() -> None:
     qvel = np.arange(14, dtype=np.float32) / 100
     state = env.reset_to(qpos, qvel, np.array([0.1, 0.0]))
     np.testing.assert_array_equal(state.obs, np.concatenate([qpos, qvel]))
-    assert int(state.info["steps"]) == 0
+    assert int(state.pipeline_state.steps) == 0
     after = env.step(state, jnp.zeros(8))
     assert (float(after.metrics["success"]), float(after.reward), float(after.done)) == (1.0, 0.0, 1.0)
     assert float(after.info["truncation"]) == 0.0
@@ -173,12 +173,13 @@ def test_teleporters_of_episodes_and_of_autoreset_draw_anew() -> None:
     qpos[:2] = entrance
     keys = jax.random.split(jax.random.key(0), 60)
     state = jax.jit(jax.vmap(lambda key: env.reset_to(qpos, np.zeros(14), env.goal_xy, key)))(keys)
-    state.info["steps"] = state.info["steps"].at[:30].set(999)
+    physics = state.pipeline_state
+    state = state.replace(pipeline_state=physics.replace(steps=physics.steps.at[:30].set(999)))
     after = jax.jit(jax.vmap(env.step))(state, jnp.zeros((60, 8)))
     assert jax.tree.structure(after) == jax.tree.structure(state)
     used = [jax.random.key_data(s.info["teleport_key"]) for s in (state, after)]
     assert len(np.unique(np.concatenate(used), axis=0)) == 120
-    np.testing.assert_array_equal(after.info["steps"], [0] * 30 + [1] * 30)
+    np.testing.assert_array_equal(after.pipeline_state.steps, [0] * 30 + [1] * 30)
     np.testing.assert_allclose(after.info["final_obs"][:, :2], np.tile(entrance, (60, 1)), atol=0.2)
     exits = env.layout.ij_to_xy(np.array(env.layout.teleporters.exits))
     out = np.asarray(after.pipeline_state.qpos[30:, :2])

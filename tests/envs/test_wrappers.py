@@ -25,11 +25,13 @@ class Slider:
 
     def init(self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None) -> PipelineState:
         none = jnp.zeros(0, jnp.int32) if extra is None else extra
-        return PipelineState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros(0), none, jnp.zeros(()))
+        return PipelineState(
+            jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros(0), none, jnp.zeros(()), jnp.zeros((), jnp.int32)
+        )
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
         qpos = jnp.where(action[0] > 8, jnp.nan, state.qpos + action)
-        return state.replace(qpos=qpos, qvel=action, carry=state.carry + 1)
+        return state.replace(qpos=qpos, qvel=action, carry=state.carry + 1, steps=state.steps + 1)
 
 
 def sliding_task(cap: int = 3) -> MazeTask:
@@ -57,9 +59,9 @@ def test_cap_truncates_and_starts_anew() -> None:
     np.testing.assert_allclose(last.info["final_obs"][:2], state.obs[:2] + jnp.array([0.0, -0.1]), atol=1e-6)
     assert not np.allclose(last.obs, last.info["final_obs"])
     np.testing.assert_array_equal(last.obs[:2], last.pipeline_state.qpos)
-    assert int(last.info["steps"]) == 0 and float(last.pipeline_state.carry) == 0.0
+    assert int(last.pipeline_state.steps) == 0 and float(last.pipeline_state.carry) == 0.0
     onward = env.step(last, jnp.zeros(2))
-    assert (float(onward.done), float(onward.info["truncation"]), int(onward.info["steps"])) == (0.0, 0.0, 1)
+    assert (float(onward.done), float(onward.info["truncation"]), int(onward.pipeline_state.steps)) == (0.0, 0.0, 1)
 
 
 def test_success_terminates_without_truncation_even_at_the_cap() -> None:
@@ -111,7 +113,7 @@ def test_a_broken_state_resets_its_own_environment_alone(physics: str, part: str
     np.testing.assert_array_equal(after.metrics["nan"], [0, 1, 0])
     np.testing.assert_array_equal(after.done, [0, 1, 0])
     np.testing.assert_array_equal(after.obs[jnp.array([0, 2])], expected.obs[jnp.array([0, 2])])
-    assert bool(jnp.isfinite(after.obs).all()) and int(after.info["steps"][1]) == 0
+    assert bool(jnp.isfinite(after.obs).all()) and int(after.pipeline_state.steps[1]) == 0
     onward = step(after, jnp.ones((3, 8)))
     np.testing.assert_array_equal(onward.metrics["nan"], [0, 0, 0])
 

@@ -182,7 +182,7 @@ def test_one_broken_simulation_is_reset_and_the_others_go_on_as_without_it(engin
     after, result = iteration(hit, keys)
     np.testing.assert_array_equal(result.finite, [True, False, True])
     assert bool(expected.finite.all())
-    assert np.isfinite(np.asarray(after.obs)).all() and int(after.info["steps"][1]) == 0  # a fresh episode
+    assert np.isfinite(np.asarray(after.obs)).all() and int(after.pipeline_state.steps[1]) == 0  # a fresh episode
     for a, b in zip(jax.tree.leaves((after, result)), jax.tree.leaves((sane, expected)), strict=True):
         if jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
             a, b = jax.random.key_data(a), jax.random.key_data(b)

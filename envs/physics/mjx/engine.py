@@ -74,14 +74,16 @@ class MjxEngine:
     def init(self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None) -> PipelineState:
         """Return the state at (qpos[nq], qvel[nv]) without warm start; there is no ``extra`` on this engine."""
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
-        return PipelineState(qpos, qvel, self._sense(qpos, qvel), jnp.zeros(0, jnp.int32), jnp.zeros_like(qvel))
+        sensed, none = self._sense(qpos, qvel), jnp.zeros(0, jnp.int32)
+        return PipelineState(qpos, qvel, sensed, none, jnp.zeros_like(qvel), jnp.zeros((), jnp.int32))
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
         """Return the state after one control step under ``action[act]`` (clamped by the model's control range)."""
         shift, mocap = self._surroundings(state.qpos)
         qpos, qvel, warmstart = self._move((state.qpos - shift, state.qvel, state.carry), mocap, action)
         qpos = qpos + shift
-        return state.replace(qpos=qpos, qvel=qvel, sensed=self._sense(qpos, qvel), carry=warmstart)
+        sensed = self._sense(qpos, qvel)
+        return state.replace(qpos=qpos, qvel=qvel, sensed=sensed, carry=warmstart, steps=state.steps + 1)
 
     def _move(self, start: Motion, mocap: jax.Array, action: jax.Array) -> Motion:
         """Make all sub-steps, with the mocap bodies at ``mocap[k, 3]``."""

@@ -70,7 +70,8 @@ class MujocoEngine:
         if self._rig.memory_size or self._rig.sensed_size:
             memory, sensed = self._start((_shape_of(memory), _shape_of(sensed)), qpos, qvel, extra)
         bits = jnp.concatenate([jnp.zeros(2 * self._stepper.nstate, jnp.uint32), memory])
-        return PipelineState(qpos, qvel, sensed, extra, MujocoCarry(bits=bits, fresh=jnp.ones((), bool)))
+        carry = MujocoCarry(bits=bits, fresh=jnp.ones((), bool))
+        return PipelineState(qpos, qvel, sensed, extra, carry, jnp.zeros((), jnp.int32))
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
         """Return the state after one control step under ``action[act]`` (clamped by the model's control range).
@@ -88,7 +89,7 @@ class MujocoEngine:
             *discrete,
         )
         carry = MujocoCarry(bits=bits, fresh=jnp.zeros_like(state.carry.fresh))
-        return PipelineState(qpos, qvel, sensed, extra[0] if extra else state.extra, carry)
+        return PipelineState(qpos, qvel, sensed, extra[0] if extra else state.extra, carry, state.steps + 1)
 
     def exact_state(self, state: PipelineState) -> tuple[np.ndarray, np.ndarray]:
         """Return the float64 (qpos[..., nq], qvel[..., nv]) behind a stepped state; for parity tests, outside jit."""

@@ -35,7 +35,7 @@ class Point:
     """The physics: a point that goes 0.1 m along its action."""
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PipelineState:
-        return PipelineState(qpos, qvel, jnp.zeros(0), jnp.zeros(0, jnp.int32), ())
+        return PipelineState(qpos, qvel, jnp.zeros(0), jnp.zeros(0, jnp.int32), (), jnp.zeros((), jnp.int32))
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:
         return state.replace(qpos=state.qpos + 0.1 * action)
