@@ -22,7 +22,7 @@ import h5py
 
 from qdos_brax import __version__
 from qdos_brax.data import cache, sources
-from qdos_brax.data.sources import Source
+from qdos_brax.data.sources import PublicDataset
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.runs.progress import Progress
@@ -71,7 +71,7 @@ def resolve(name: str) -> Path:
     return path if source is None else fetch(source, cache.folder())
 
 
-def fetch(source: Source, folder: Path, patience: Patience = Patience()) -> Path:
+def fetch(source: PublicDataset, folder: Path, patience: Patience = Patience()) -> Path:
     """The file of ``source`` in ``folder``, downloaded if it is not there yet and checked if it is.
 
     What is under the file's name is always whole. A download that broke off goes on where it was, if the server can

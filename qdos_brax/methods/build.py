@@ -10,7 +10,7 @@ import numpy as np
 
 from qdos_brax import config as configs
 from qdos_brax.config import Config
-from qdos_brax.config.methods import METHODS, Recipe
+from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.errors import UserError
@@ -66,7 +66,7 @@ def build_phases(config: Config, env: Any, dataset: Dataset, population: Populat
     labelled = round(high.batch_size * high.offline_fraction) > 0
     guide = None if task.recipe.guide is None else _GUIDES[task.recipe.guide](config, env)
     return [
-        *_SOURCES[task.recipe.source].phases(task),
+        *_SOURCES[task.recipe.low_level].phases(task),
         *([] if guide is None else [_offline_phase(task, "guide", guide.learner, config.guide.updates)]),
         *([LabelPhase(config, task.data, population, source)] if labelled else []),
         OnlinePhase(
@@ -100,14 +100,14 @@ def plan_members(config: Config, env: Any, dataset: Dataset, members: Sequence[M
 
 def make_source(config: Config, env: Any) -> SkillSource:
     """The method's source of low-level behaviour."""
-    return _SOURCES[METHODS[config.method].source].make(config, env)
+    return _SOURCES[METHODS[config.method].low_level].make(config, env)
 
 
 class _Task(NamedTuple):
     """What every phase of a run is made from."""
 
     config: Config
-    recipe: Recipe
+    recipe: Method
     env: Any
     dataset: Dataset
     data: DeviceData
@@ -283,7 +283,7 @@ def _skill_model(config: Config, env: Any) -> SkillModel:
     )
 
 
-def _weights(config: Config, recipe: Recipe, env: Any) -> SegmentWeights:
+def _weights(config: Config, recipe: Method, env: Any) -> SegmentWeights:
     if not recipe.weighted:
         return UniformWeights()
     if config.skills.advantage != "latent":
@@ -293,7 +293,7 @@ def _weights(config: Config, recipe: Recipe, env: Any) -> SegmentWeights:
 
 
 def _information(
-    config: Config, recipe: Recipe, env: Any, model: SkillModel, normaliser: Normaliser, data: DeviceData
+    config: Config, recipe: Method, env: Any, model: SkillModel, normaliser: Normaliser, data: DeviceData
 ) -> Information | None:
     if not recipe.information:
         return None
