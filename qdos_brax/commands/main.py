@@ -10,6 +10,7 @@ from pathlib import Path
 
 from qdos_brax import __version__
 from qdos_brax.commands.arguments import Parser, guarded, parse, positive
+from qdos_brax.commands.config import add_parser as add_config
 from qdos_brax.errors import UserError
 
 
@@ -61,6 +62,8 @@ def main_parser(argv: Sequence[str]) -> Parser:
 
     tasks = commands.add_parser("tasks", help="list the tasks and their aliases")
     tasks.set_defaults(run=_tasks)
+
+    add_config(commands)
 
     doctor = commands.add_parser("doctor", help="check versions, devices, caches and callbacks of this machine")
     doctor.set_defaults(run=_doctor)

@@ -12,6 +12,7 @@ from qdos_brax import __version__
 from qdos_brax.commands.arguments import Parser, guarded, natural, parse, positive
 from qdos_brax.config import Config, load_programs, presets
 from qdos_brax.config.methods import METHODS
+from qdos_brax.config.schema import get_field, labelled, pretrain_keys
 from qdos_brax.errors import UserError
 
 
@@ -26,15 +27,15 @@ def train_parser() -> Parser:
     """Return the parser of ``train.py``."""
     parser = Parser(
         prog="python train.py",
-        description="Collects or reads data, pretrains skills, labels the data, learns online, evaluates and reports.",
-        epilog="Every key of config.yaml can be set with --set; the values of a task and the presets lie in configs/.",
+        description="Collect or read data, pretrain skills, label the data, learn online, evaluate and report.",
+        epilog="Any key of config.yaml can be set with --set; python -m qdos_brax config lists and explains the keys.",
     )
     parser.add_argument("--env", metavar="TASK", help="the task, as listed by: python -m qdos_brax tasks")
-    parser.add_argument(
-        "--alpha", metavar="A[,A..]", help="weight of the mutual-information loss; several values make a scan"
-    )
+    for label, key in labelled().items():
+        meaning = get_field(key).metadata["meaning"]
+        parser.add_argument(f"--{label}", metavar="X[,X..]", help=f"{meaning}; several values make a scan")
     parser.add_argument("--seed", metavar="S[,S..]", help="seed; several make a scan (default 0)")
-    methods = "; ".join(f"{name}: {recipe.summary}" for name, recipe in METHODS.items())
+    methods = "; ".join(f"{name}: {method.summary}" for name, method in METHODS.items())
     parser.add_argument(
         "--method",
         metavar="NAME[,NAME..]",
@@ -49,13 +50,13 @@ def train_parser() -> Parser:
     parser.add_argument(
         "--resume",
         metavar="DIR",
-        help="go on with the run or comparison in DIR, exactly where it was; takes no other flag",
+        help="continue the run or comparison in DIR exactly where it stopped; takes no other flag",
     )
     parser.add_argument(
         "--dataset",
         metavar="FILE",
-        help="OGBench .npz, D4RL .hdf5, Minari folder, or a name such as antmaze-large-navigate-v0, which is fetched "
-        "(default: the task's own set, collected once)",
+        help="OGBench .npz, D4RL .hdf5, Minari folder, or the name of a public data set such as "
+        "antmaze-large-navigate-v0, which is downloaded (default: the task's own set, collected once)",
     )
     parser.add_argument(
         "--physics",
@@ -64,9 +65,11 @@ def train_parser() -> Parser:
     )
     parser.add_argument("--steps", metavar="N", help="environment steps of the online phase")
     parser.add_argument(
-        "--pretrain-steps", metavar="N", help="gradient steps of each thing that is learned from the data alone"
+        "--pretrain-steps", metavar="N", help="gradient steps of each part that is learned from the data alone"
     )
-    parser.add_argument("--wandb", action="store_true", default=None, help="log to Weights & Biases too (extra: wandb)")
+    parser.add_argument(
+        "--wandb", action="store_true", default=None, help="also log to Weights & Biases (extra: wandb)"
+    )
     parser.add_argument("--zip", action="store_true", help="pair the lists of a scan instead of taking their product")
     parser.add_argument(
         "--sample",
@@ -77,7 +80,8 @@ def train_parser() -> Parser:
     parser.add_argument(
         "--members-per-program",
         metavar="N",
-        help="members of a scan that a device trains at once; the others wait their turn (default: chosen, and said)",
+        help="members of a scan that a device trains at once; the others take turns (default: chosen automatically "
+        "and printed)",
     )
     parser.add_argument(
         "--set",
@@ -85,17 +89,17 @@ def train_parser() -> Parser:
         action="append",
         default=[],
         help="any key of the configuration, such as skills.kl_weight=0.2, or 0.1,0.2 to scan it; sizes take lists too, "
-        "one program each (skills.horizon=4,20); may be given again and again",
+        "one program each (skills.horizon=4,20); may be repeated",
     )
     parser.add_argument(
         "--distributed",
         action="store_true",
-        help="share the members with other processes that run the same command on a common --out or --resume; found by "
-        "the variables of Slurm, Open MPI or Kubernetes, or by the three flags below",
+        help="share the members with other processes that run the same command on a common --out or --resume; they are "
+        "found by the variables of Slurm, Open MPI or Kubernetes, or by the three flags below",
     )
-    parser.add_argument("--coordinator", metavar="HOST:PORT", help="where the first process can be met")
-    parser.add_argument("--processes", metavar="N", type=positive, help="how many processes there are")
-    parser.add_argument("--process-id", metavar="I", type=natural, help="the number of this one, from 0")
+    parser.add_argument("--coordinator", metavar="HOST:PORT", help="address of the first process")
+    parser.add_argument("--processes", metavar="N", type=positive, help="number of processes")
+    parser.add_argument("--process-id", metavar="I", type=natural, help="number of this process, from 0")
     parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
     return parser
 
@@ -107,7 +111,7 @@ def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:
         UserError: a value is wrong.
     """
     by_key = {
-        "skills.alpha": args.alpha,
+        **{key: getattr(args, label) for label, key in labelled().items()},
         "seed": args.seed,
         "out": args.out,
         "dataset": args.dataset,
@@ -116,12 +120,7 @@ def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:
         "scan.samples": args.sample,
         "members_per_program": args.members_per_program,
         "high_level.env_steps": args.steps,
-        "values.updates": args.pretrain_steps,
-        "skills.updates": args.pretrain_steps,
-        "policy.updates": args.pretrain_steps,
-        "guide.updates": args.pretrain_steps,
-        "hilbert.updates": args.pretrain_steps,
-        "diveoff.updates": args.pretrain_steps,
+        **dict.fromkeys(pretrain_keys(), args.pretrain_steps),
         "run.wandb": args.wandb,
     }
     flags = {key: value for key, value in by_key.items() if value is not None}

@@ -1,46 +1,27 @@
-"""The configuration: frozen dataclasses, YAML layers over them, and one clear line for every wrong key or value.
+"""The configuration: frozen dataclasses, named layers over their defaults, and one clear line for every mistake.
 
-Layers, each laid over the one before: the defaults below (the paper's values), ``configs/<family>.yaml``, the method's
-recipe (``qdos_brax.methods``), ``configs/presets/<preset>.yaml`` (with its own sections: ``sources:``, by the recipe's
-source of behaviour, and over it ``families:``, which may hold ``sources:`` again), the command line's flags,
-``--set key=value``.
+Layers, each laid over the one before: the defaults of the fields (the paper's values), ``configs/<family>.yaml``, the
+method's published values (``config/methods.py``), ``configs/presets/<preset>.yaml`` with its own sections
+(``low_level:``, by the method's low-level policy, and over it ``families:``, which may hold ``low_level:`` again), the
+flags of the command line, ``--set key=value``. ``python -m qdos_brax config KEY`` shows which layer set a value.
 
-Two kinds of field are told apart by ``metadata["scan"]``. A scannable field is a number that a learner takes as an
+The mark ``metadata["scan"]`` of a field separates two kinds. A scannable field is a number that a learner takes as an
 argument of its jitted program: it may hold a list, and every member of the scan gets its own value without a new
 compilation (``hyper_tree``, ``members``). Every other field shapes the program: several values of it make several
-programs, each a Config of its own (``load_programs``).
+programs, each with a Config of its own (``load_programs``).
 """
 
 from __future__ import annotations
 
-from qdos_brax.config.layers import (
-    config_hash,
-    default_preset,
-    families,
-    from_yaml,
-    load_config,
-    load_programs,
-    presets,
-    replace,
-    to_yaml,
-)
+from qdos_brax.config.baseline_groups import DiveOffConfig, GuideConfig, HilbertConfig, PolicyConfig
+from qdos_brax.config.layers import Layer, default_preset, families, family_layers, presets, run_layers
+from qdos_brax.config.load import config_hash, from_yaml, load_config, load_programs, programs_of, replace, to_yaml
+from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig
 from qdos_brax.config.rules import nearest
-from qdos_brax.config.scan import hyper_tree, members, population_hyper
-from qdos_brax.config.schema import (
-    Config,
-    DataConfig,
-    DiveOffConfig,
-    EvalConfig,
-    GuideConfig,
-    HighLevelConfig,
-    HilbertConfig,
-    LabelsConfig,
-    PolicyConfig,
-    RunConfig,
-    ScanConfig,
-    SkillsConfig,
-    ValuesConfig,
-)
+from qdos_brax.config.run_groups import RunConfig, ScanConfig
+from qdos_brax.config.scan import hyper_tree, members, population_hyper, values_by_key
+from qdos_brax.config.schema import Config
+from qdos_brax.config.skill_groups import DataConfig, SkillsConfig, ValuesConfig
 
 __all__ = [
     "Config",
@@ -51,6 +32,7 @@ __all__ = [
     "HighLevelConfig",
     "HilbertConfig",
     "LabelsConfig",
+    "Layer",
     "PolicyConfig",
     "RunConfig",
     "ScanConfig",
@@ -59,6 +41,7 @@ __all__ = [
     "config_hash",
     "default_preset",
     "families",
+    "family_layers",
     "from_yaml",
     "hyper_tree",
     "load_config",
@@ -67,6 +50,9 @@ __all__ = [
     "nearest",
     "population_hyper",
     "presets",
+    "programs_of",
     "replace",
+    "run_layers",
     "to_yaml",
+    "values_by_key",
 ]

@@ -1,8 +1,8 @@
-"""The methods, each a recipe of the same parts; ``build`` puts the parts together. To add a method is to add a recipe.
+"""The methods, each an entry of one table of the same parts; ``qdos_brax.methods.build`` puts the parts together.
 
-A recipe holds the numbers that its authors published, by dotted configuration key; they are laid over the task's YAML
-and under the preset, the flags and ``--set`` (``qdos_brax.config``). Published numbers that agree with the defaults
-are not repeated.
+An entry holds the numbers that its authors published, by dotted configuration key; they are laid over the task's YAML
+and under the preset, the flags and ``--set`` (``qdos_brax.config``). Published numbers equal to the defaults are not
+repeated.
 """
 
 from __future__ import annotations
@@ -13,23 +13,25 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """What a method is made of.
+class Method:
+    """Hold the parts and the published values of a method.
 
     Attributes:
         summary: one line for a list of methods.
-        source: of low-level behaviour: "trajectory" (a VAE of segments), "transition" (a VAE of single transitions),
-            "direction" (in a Hilbert representation) or "action" (none: the policy acts itself).
-        weighted: segments are weighted by their advantage (else all count the same, and no values are learned).
-        information: the mutual-information term is on.
-        guide: what acts for the first steps of an episode online: "diffusion", or None.
-        policy: the flat policy that is learned from the data alone, "bc" or "iql", and then nothing is learned online.
+        low_level: kind of low-level policy: "trajectory" (a VAE of segments), "transition" (a VAE of single
+            transitions), "direction" (conditioned on directions in a Hilbert representation) or "action" (none: the
+            policy chooses actions itself).
+        weighted: whether segments are weighted by their advantage; otherwise all count the same, and no values are
+            learned.
+        information: whether the mutual-information term is on.
+        guide: the policy that acts in the first steps of an episode online, "diffusion", or None.
+        policy: the flat policy that is learned from the data alone, "bc" or "iql", with no online learning; or None.
         settings: published values by dotted key.
-        by_family: the same, for single task families.
+        by_family: published values of single task families.
     """
 
     summary: str
-    source: str = "trajectory"
+    low_level: str = "trajectory"
     weighted: bool = False
     information: bool = False
     guide: str | None = None
@@ -62,83 +64,83 @@ _OFFLINE_WIDTHS = {
 }
 
 METHODS = {
-    "qdos": Recipe("advantage-weighted, diverse skills; rewards of the data", weighted=True, information=True),
+    "qdos": Method("advantage-weighted, diverse skills; rewards of the data", weighted=True, information=True),
     # Wilcoxson et al. 2025, "Leveraging Skills from Unlabeled Prior Data for Efficient Online Exploration". Their code
     # has skills.horizon=4, the comparison in the QDOS paper 20.
-    "supe": Recipe(
+    "supe": Method(
         "unweighted skills; the data without its rewards, novelty made up for (Wilcoxson et al. 2025)",
         settings=_UNLABELLED,
         by_family=_UNLABELLED_BY_FAMILY,
     ),
     # Ajay et al. 2021 (OPAL), Pertsch et al. 2020 (SPiRL: with high_level.regulariser=prior); online as in
     # Wilcoxson et al. 2025, "online w/ trajectory skills".
-    "trajectory-skills": Recipe(
+    "trajectory-skills": Method(
         "SUPE's skills, learned with online alone (OPAL, Ajay et al. 2021; SPiRL, Pertsch et al. 2020)",
         settings=_ONLINE_ONLY,
         # SPiRL's target divergence: 1 in the maze, 5 in the kitchen (appendix).
         by_family={family: {"high_level.target_divergence": 5.0} for family in _MANIPULATION},
     ),
     # Li et al. 2023, "Accelerating exploration with unlabeled prior data"; the coefficient as SUPE's authors run it.
-    "explore": Recipe(
+    "explore": Method(
         "no skills; the data without its rewards, novelty made up for (ExPLORe, Li et al. 2023)",
-        source="action",
+        low_level="action",
         settings=_FLAT | _UNLABELLED | {"labels.rnd_coefficient": 2.0},
         by_family=_UNLABELLED_BY_FAMILY,
     ),
     # Ball et al. 2023, "Efficient online reinforcement learning with offline data".
-    "rlpd": Recipe(
+    "rlpd": Method(
         "no skills; SAC with an ensemble, half of each batch from the data (RLPD, Ball et al. 2023)",
-        source="action",
+        low_level="action",
         settings=_FLAT | {"labels.rnd_coefficient": 0.0},
     ),
     # Park et al. 2024, "Foundation policies with Hilbert representations"; online as in Wilcoxson et al. 2025.
-    "hilp": Recipe(
+    "hilp": Method(
         "directions in a Hilbert representation as skills, online as SUPE (HILP, Park et al. 2024)",
-        source="direction",
+        low_level="direction",
         settings=_UNLABELLED | _DIRECTIONS,
         by_family=_UNLABELLED_BY_FAMILY,
     ),
-    "hilp-online": Recipe(
+    "hilp-online": Method(
         "HILP's skills, learned with online alone",
-        source="direction",
+        low_level="direction",
         settings=_ONLINE_ONLY | _DIRECTIONS,
     ),
     # Uchendu et al. 2022, "Jump-start reinforcement learning", with the diffusion policy, the schedule and the numbers
     # of Wilcoxson et al. 2025 (published commands): online ExPLORe without the data.
-    "diffusion-jsrl": Recipe(
+    "diffusion-jsrl": Method(
         "no skills; a diffusion clone of the data acts for an episode's first steps (JSRL, Uchendu et al. 2022)",
-        source="action",
+        low_level="action",
         guide="diffusion",
         settings=_FLAT | _ONLINE_ONLY | {"labels.rnd_coefficient": 2.0, "high_level.init_temperature": 1.0},
         by_family={family: {"guide.ratio": 0.75} for family in _MANIPULATION},
     ),
     # Kostrikov et al. 2022, "Offline reinforcement learning with implicit Q-learning": expectile 0.9 and beta 10 in
     # mazes, 0.7 and 0.5 in the kitchen; Park et al. 2025 (OGBench): 0.9 and 10.
-    "iql": Recipe(
+    "iql": Method(
         "no skills, offline alone: implicit Q-learning (Kostrikov et al. 2022)",
-        source="action",
+        low_level="action",
         policy="iql",
         settings=_FLAT | {"values.estimator": "iql", "values.expectile": 0.9, "policy.inverse_temperature": 10.0},
         by_family=_OFFLINE_WIDTHS | {"kitchen": {"values.expectile": 0.7, "policy.inverse_temperature": 0.5}},
     ),
-    "bc": Recipe(
+    "bc": Method(
         "no skills, offline alone: behaviour cloning",
-        source="action",
+        low_level="action",
         policy="bc",
         settings=_FLAT,
         by_family=_OFFLINE_WIDTHS,
     ),
     # Osa and Harada 2024, "Discovering multiple solutions from a single task in offline reinforcement learning": z of
     # dimension 2 from [-2, 2], which the high level draws on as the paper does on its own skills.
-    "diveoff": Recipe(
+    "diveoff": Method(
         "latents of single transitions, good and diverse, as skills (DiveOff, Osa and Harada 2024)",
-        source="transition",
+        low_level="transition",
         settings={"skills.latent_dim": 2, "skills.latent_box": 2.0, "high_level.latent_map": "box"},
     ),
 }
 
 
 def settings(method: str, family: str) -> dict[str, Any]:
-    """A recipe's published values for a task family, by dotted key."""
-    recipe = METHODS[method]
-    return {**recipe.settings, **recipe.by_family.get(family, {})}
+    """Return a method's published values for a task family, by dotted key."""
+    entry = METHODS[method]
+    return {**entry.settings, **entry.by_family.get(family, {})}

@@ -1,4 +1,4 @@
-"""What a field of the configuration accepts, and the one clear line for everything else."""
+"""Rules of the configuration's fields: what each accepts, and one clear line for everything else."""
 
 from __future__ import annotations
 
@@ -13,16 +13,25 @@ import yaml
 
 from qdos_brax.errors import UserError
 
+MAX_COUNT = 2**31 - 1
+_PLAIN_KINDS = {"bool": "true or false", "text": "text", "path": "path"}
+_NUMBER_KINDS = {
+    "int": "whole number",
+    "float": "number",
+    "widths": "one or more whole numbers",
+    "seeds": "one or more whole numbers",
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """What a field accepts.
+    """Hold what a field accepts.
 
     Attributes:
         kind: "int", "float", "bool", "text", "path", "widths" (a list of layer widths) or "seeds".
         low: smallest value accepted.
         high: largest value accepted.
-        above: if True, ``low`` itself is refused.
+        above: whether ``low`` itself is refused.
         choices: the only texts accepted; empty for any.
     """
 
@@ -33,43 +42,77 @@ class Rule:
     choices: tuple[str, ...] = ()
 
 
-def field(default: Any, rule: Rule, scan: bool = False) -> Any:
-    """A dataclass field with its rule; ``scan`` if a scan may vary it."""
-    return dataclasses.field(default=default, metadata={"rule": rule, "scan": scan})
+def field(
+    default: Any, meaning: str, rule: Rule, *, scan: bool = False, label: str = "", pretrain: bool = False
+) -> Any:
+    """Return a dataclass field with its rule and its marks.
+
+    Args:
+        default: the paper's value.
+        meaning: what the value means, for ``python -m qdos_brax config``.
+        rule: the values accepted.
+        scan: whether the members of one program may have different values.
+        label: short name of the key: its flag on the command line, its column in metrics.csv and its entry in
+            summary.json, which are there for every run; empty for none.
+        pretrain: whether ``--pretrain-steps`` sets it.
+    """
+    marks = {"meaning": meaning, "rule": rule, "scan": scan, "label": label, "pretrain": pretrain}
+    return dataclasses.field(default=default, metadata=marks)
 
 
-def count(default: int, low: int = 1) -> Any:
-    """A whole number from ``low`` on."""
-    return field(default, Rule("int", low=low, high=2**31 - 1))
+def count(default: int, meaning: str, low: int = 1, pretrain: bool = False) -> Any:
+    """Return a field for a whole number, at least ``low``."""
+    return field(default, meaning, Rule("int", low=low, high=MAX_COUNT), pretrain=pretrain)
 
 
-def number(default: float, low: float = 0.0, high: float = math.inf, above: bool = False, scan: bool = True) -> Any:
-    """A real number from ``low`` to ``high``; ``above``: not ``low`` itself."""
-    return field(default, Rule("float", low, high, above), scan)
+def number(
+    default: float,
+    meaning: str,
+    low: float = 0.0,
+    high: float = math.inf,
+    above: bool = False,
+    scan: bool = True,
+    label: str = "",
+) -> Any:
+    """Return a field for a real number in [low, high], or in (low, high] if ``above``."""
+    return field(default, meaning, Rule("float", low, high, above), scan=scan, label=label)
 
 
-def rate(default: float) -> Any:
-    """A learning rate: above 0, at most 1."""
-    return number(default, high=1.0, above=True)
+def rate(default: float, meaning: str = "Adam learning rate") -> Any:
+    """Return a field for a learning rate in (0, 1]."""
+    return number(default, meaning, high=1.0, above=True)
 
 
-def choice(default: str, *choices: str) -> Any:
-    """One of a few words."""
-    return field(default, Rule("text", choices=choices))
+def choice(default: str, meaning: str, *choices: str) -> Any:
+    """Return a field for one of a few words."""
+    return field(default, meaning, Rule("text", choices=choices))
 
 
-def flag(default: bool) -> Any:
-    """True or false."""
-    return field(default, Rule("bool"))
+def flag(default: bool, meaning: str) -> Any:
+    """Return a field for true or false."""
+    return field(default, meaning, Rule("bool"))
 
 
-def widths(*default: int) -> Any:
-    """Widths of layers."""
-    return field(default, Rule("widths", low=1, high=2**20))
+def widths(default: tuple[int, ...], meaning: str) -> Any:
+    """Return a field for the widths of layers."""
+    return field(default, meaning, Rule("widths", low=1, high=2**20))
+
+
+def describe(rule: Rule) -> str:
+    """Return the accepted values in words, as "number, above 0 and at most 1"."""
+    if rule.choices:
+        return f"one of {', '.join(rule.choices)}"
+    if rule.kind in _PLAIN_KINDS:
+        return _PLAIN_KINDS[rule.kind]
+    return f"{_NUMBER_KINDS[rule.kind]}, {_range(rule)}"
 
 
 def convert(key: str, value: Any, leaf: dataclasses.Field[Any]) -> Any:
-    """``value`` in the field's type, within its range."""
+    """Return ``value`` in the field's type.
+
+    Raises:
+        UserError: the value is of another type or out of range.
+    """
     rule: Rule = leaf.metadata["rule"]
     if rule.kind == "path":
         return _path(key, value)
@@ -80,9 +123,7 @@ def convert(key: str, value: Any, leaf: dataclasses.Field[Any]) -> Any:
     if rule.kind == "text":
         return _text(key, value, rule)
     items = _items(value)
-    if rule.kind == "widths":
-        return tuple(int(_number_in(key, item, rule, whole=True)) for item in _some(key, items))
-    if rule.kind == "seeds":
+    if rule.kind in ("widths", "seeds"):
         return tuple(int(_number_in(key, item, rule, whole=True)) for item in _some(key, items))
     if isinstance(value, list | tuple) or len(items) > 1:
         if not leaf.metadata["scan"]:
@@ -94,12 +135,12 @@ def convert(key: str, value: Any, leaf: dataclasses.Field[Any]) -> Any:
 
 
 def values_in(key: str, value: Any, whole: bool = False) -> tuple[float, ...]:
-    """The numbers that ``value`` lists, or the one that it is, whatever the key's range."""
+    """Return the numbers that ``value`` lists, or its one number, whatever the key's range."""
     return tuple(_number_in(key, item, Rule("float"), whole) for item in _some(key, _items(value)))
 
 
 def choices_in(key: str, value: Any, rule: Rule) -> list[Any]:
-    """What ``value`` lists of a field that takes one value; widths are a list, so several are lists in a list."""
+    """Return the alternatives that ``value`` lists for a field that takes one; several widths are lists in a list."""
     if rule.kind == "widths":
         nested = isinstance(value, list) and any(isinstance(item, list) for item in value)
         if isinstance(value, str) and ";" in value:
@@ -109,7 +150,7 @@ def choices_in(key: str, value: Any, rule: Rule) -> list[Any]:
 
 
 def _read(item: Any) -> Any:
-    """A piece of a text as YAML reads it, so that "true" is no word."""
+    """Read a piece of a text as YAML does, so that "true" is no word."""
     return yaml.safe_load(item) if isinstance(item, str) else item
 
 
@@ -142,7 +183,7 @@ def _some(key: str, items: list[Any]) -> list[Any]:
 
 
 def _number_in(key: str, value: Any, rule: Rule, whole: bool = False) -> float:
-    """``value`` as a number in the rule's range; texts such as "1e5" (a text in YAML) are read too."""
+    """Return ``value`` as a number in the rule's range; it may be a text such as "1e5", which YAML takes for a text."""
     kind = "a whole number" if whole else "a number"
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise UserError(f"{key} must be {kind}, not {value!r}")
@@ -161,11 +202,11 @@ def _number_in(key: str, value: Any, rule: Rule, whole: bool = False) -> float:
 
 def _range(rule: Rule) -> str:
     low = f"{'above' if rule.above else 'at least'} {rule.low:.10g}"
-    return low if rule.high in (math.inf, 2**31 - 1) else f"{low} and at most {rule.high:.10g}"
+    return low if rule.high in (math.inf, MAX_COUNT) else f"{low} and at most {rule.high:.10g}"
 
 
 def nearest(word: str, known: Sequence[str]) -> str:
-    """', did you mean ...?' with the most similar known word; empty if none is similar."""
+    """Return ", did you mean ..?" with the most similar known word; empty if none is similar."""
     last_words: dict[str, str] = {}
     for name in known:
         last_words.setdefault(name.rpartition(".")[2], name)

@@ -1,4 +1,4 @@
-"""The axis of seeds and hyperparameters: what a scan varies without a new compilation."""
+"""The axis of seeds and hyperparameters, which a scan varies without a new compilation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from qdos_brax.config.rules import values_in
-from qdos_brax.config.schema import Config, ScanConfig, get, leaves
+from qdos_brax.config.run_groups import ScanConfig
+from qdos_brax.config.schema import Config, get, labelled, leaves
 from qdos_brax.errors import UserError
 
 _DISTRIBUTION = re.compile(r"\s*(\w+)\s*\(([^(),]*),([^(),]*)\)\s*")
@@ -20,16 +21,16 @@ _DRAWS_PER_SETTING = 100
 
 
 def hyper_tree(config: Config, member: Mapping[str, Any] | None = None) -> dict[str, float]:
-    """The numbers that a scan may vary, by dotted key ("skills.alpha").
+    """Return the numbers that a scan may vary, by dotted key ("skills.alpha").
 
     Args:
-        config: the run.
-        member: one of ``members(config)``; its values are taken where the configuration holds lists.
+        config: the run's configuration.
+        member: one of ``members(config)``; its values replace the lists of the configuration.
 
     Raises:
-        UserError: a field holds a list and no member says which value of it is meant.
+        UserError: a field holds a list and there is no member to choose one of its values.
     """
-    chosen = {("skills.alpha" if key == "alpha" else key): value for key, value in (member or {}).items()}
+    chosen = {} if member is None else values_by_key(member)
     tree = {}
     for key, field in leaves(Config):
         if field.metadata["scan"]:
@@ -41,11 +42,11 @@ def hyper_tree(config: Config, member: Mapping[str, Any] | None = None) -> dict[
 
 
 def members(config: Config) -> list[dict[str, Any]]:
-    """The population: one dict per member, all different.
+    """Return the population: one dict per member, all different.
 
-    Each holds "seed", "alpha", and the dotted key of every other field that varies. How the lists combine says
-    ``config.scan``: by product, seeds first; as pairs, seeds included; or, where settings were drawn, every seed with
-    every setting.
+    Each holds "seed", the labelled keys by their label ("alpha"), and every other field that varies by its dotted key.
+    ``config.scan`` decides how the lists combine: by product, seeds first; as pairs, seeds included; or, if settings
+    were drawn, every seed with every setting.
     """
     varied = _varied(config)
     if config.scan.samples:
@@ -55,20 +56,31 @@ def members(config: Config) -> list[dict[str, Any]]:
         rows = list(_pairs(varied))
     else:
         rows = list(itertools.product(*([(key, value) for value in values] for key, values in varied.items())))
-    return [dict(row) for row in dict.fromkeys(rows)]
+    labels = {key: label for label, key in labelled().items()}
+    return [{labels.get(key, key): value for key, value in row} for row in dict.fromkeys(rows)]
+
+
+def values_by_key(member: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a member, or of its entry in summary.json, by dotted key; the seed is none.
+
+    Raises:
+        KeyError: a labelled key is missing.
+    """
+    dotted = {key: value for key, value in member.items() if "." in key}
+    return dotted | {key: member[label] for label, key in labelled().items()}
 
 
 def population_hyper(config: Config, chosen: Sequence[Mapping[str, Any]] | None = None) -> dict[str, np.ndarray]:
-    """``hyper_tree`` of the ``chosen`` members (None for all), stacked: float32[members] by dotted key."""
+    """Stack ``hyper_tree`` over the ``chosen`` members (None for all): float32[members] by dotted key."""
     trees = [hyper_tree(config, member) for member in (members(config) if chosen is None else chosen)]
     return {key: np.asarray([tree[key] for tree in trees], np.float32) for key in trees[0]}
 
 
 def check(config: Config) -> None:
-    """Whether what was asked for makes sense as a scan.
+    """Check that the lists of a configuration make a scan.
 
     Raises:
-        UserError: a member is asked for twice, or lists that shall be paired have unequal lengths.
+        UserError: two members are the same, or lists to be paired have unequal lengths.
     """
     several = {key: values for key, values in _varied(config).items() if len(values) > 1}
     if config.scan.samples:
@@ -84,18 +96,20 @@ def check(config: Config) -> None:
         return
     for key, values in several.items():
         if len(set(values)) < len(values):
-            key = "skills.alpha" if key == "alpha" else key
             raise UserError(f"{key} holds the same value twice: {', '.join(map(str, values))}")
 
 
 def drawn(values: Mapping[str, Any]) -> dict[str, Any]:
-    """``values`` (by dotted key, not converted yet) with drawn numbers where distributions and lists stand.
+    """Replace distributions and lists by drawn numbers, if ``scan.samples`` asks for them.
 
-    With ``scan.samples``, "uniform(a,b)" and "loguniform(a,b)" are drawn from, a list is one to draw from with equal
-    chances, and no setting comes twice.
+    "uniform(a,b)" and "loguniform(a,b)" are drawn from, values of a list are drawn with equal chances, and no setting
+    comes twice.
+
+    Args:
+        values: by dotted key, not converted yet.
 
     Raises:
-        UserError: a distribution is wrong or not wanted, or there are fewer settings than asked for.
+        UserError: a distribution is wrong or nothing is to be drawn, or there are fewer settings than asked for.
     """
     scannable = [key for key, field in leaves(Config) if field.metadata["scan"] and key in values]
     written = {key: distribution(key, values[key]) for key in scannable}
@@ -129,7 +143,11 @@ def drawn(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def distribution(key: str, value: Any) -> tuple[str, float, float] | None:
-    """(name, low, high) of "name(low,high)"; None of what is no such text."""
+    """Read "name(low,high)" as (name, low, high); return None for any other value.
+
+    Raises:
+        UserError: there is no such distribution, or its bounds are wrong.
+    """
     match = _DISTRIBUTION.fullmatch(value) if isinstance(value, str) else None
     if match is None:
         return None
@@ -142,25 +160,27 @@ def distribution(key: str, value: Any) -> tuple[str, float, float] | None:
 
 
 def _varied(config: Config) -> dict[str, tuple[Any, ...]]:
-    """The seeds, alpha, and every other field that holds several values."""
-    alpha = config.skills.alpha
-    varied: dict[str, tuple[Any, ...]] = {"seed": config.seed, "alpha": alpha if isinstance(alpha, tuple) else (alpha,)}
+    """Return the seeds, the labelled fields, and every other field that holds several values, by dotted key."""
+    varied: dict[str, tuple[Any, ...]] = {"seed": config.seed}
+    for key in labelled().values():
+        value = get(config, key)
+        varied[key] = value if isinstance(value, tuple) else (value,)
     for key, field in leaves(Config):
         value = get(config, key)
-        if field.metadata["scan"] and isinstance(value, tuple) and key != "skills.alpha":
+        if field.metadata["scan"] and isinstance(value, tuple):
             varied[key] = value
     return varied
 
 
 def _pairs(varied: Mapping[str, tuple[Any, ...]]) -> Iterator[tuple[tuple[str, Any], ...]]:
-    """First with first, second with second, ..; a single value goes with each."""
+    """Yield the first values together, then the second ones, and so on; a single value goes with each."""
     count = max((len(values) for values in varied.values()), default=1)
     for index in range(count):
         yield tuple((key, values[index % len(values)]) for key, values in varied.items())
 
 
 def _draws(name: str, low: float, high: float, stream: np.random.Generator) -> Iterator[float]:
-    """Numbers of the distribution, to six digits, as they can be read in a table."""
+    """Yield numbers of the distribution, to six digits, as they can be read in a table."""
     while True:
         if name == "uniform":
             number = stream.uniform(low, high)

@@ -21,7 +21,7 @@ import h5py
 
 from qdos_brax import __version__
 from qdos_brax.data import cache, sources
-from qdos_brax.data.sources import Source
+from qdos_brax.data.sources import PublicDataset
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.runs.fingerprints import sha256
@@ -86,7 +86,7 @@ def resolve(name: str) -> DataFile:
     return DataFile(path, None) if source is None else fetch(source, cache.folder())
 
 
-def fetch(source: Source, folder: Path, patience: Patience = Patience()) -> DataFile:
+def fetch(source: PublicDataset, folder: Path, patience: Patience = Patience()) -> DataFile:
     """Return the file of ``source`` in ``folder``: download it if it is missing, check it if it is not.
 
     A file under this name is always complete. An interrupted download continues where it stopped if the server can do

@@ -1,4 +1,4 @@
-"""Which public data sets there are, and where."""
+"""The public data sets and their addresses."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _D4RL_FILES = {
 
 
 @dataclass(frozen=True)
-class Source:
-    """A public file.
+class PublicDataset:
+    """Describe a public data file.
 
     Attributes:
-        name: what users call it.
-        file_name: what it is called here.
-        urls: where it lies, the original first.
+        name: its public name.
+        file_name: name of the downloaded file.
+        urls: its addresses, the original first.
     """
 
     name: str
@@ -48,15 +48,15 @@ class Source:
     urls: tuple[str, ...]
 
 
-def find(name: str) -> Source | None:
-    """The public data set called ``name``: OGBench's (also ``-val``) or D4RL's; None where there is none."""
+def find(name: str) -> PublicDataset | None:
+    """Return the public data set called ``name``, of OGBench (also ``-val``) or D4RL; None if there is none."""
     if _OGBENCH_NAME.fullmatch(name):
-        return Source(name, f"{name}.npz", tuple(f"{base}{name}.npz" for base in _OGBENCH))
+        return PublicDataset(name, f"{name}.npz", tuple(f"{base}{name}.npz" for base in _OGBENCH))
     if name in _D4RL_FILES:
-        return Source(name, f"{name}.hdf5", (_D4RL + _D4RL_FILES[name],))
+        return PublicDataset(name, f"{name}.hdf5", (_D4RL + _D4RL_FILES[name],))
     return None
 
 
 def examples() -> str:
-    """Names for an error line."""
+    """Return example names for an error line."""
     return "antmaze-large-navigate-v0 (OGBench), antmaze-large-play-v2 (D4RL)"

@@ -13,7 +13,7 @@ import numpy as np
 
 from qdos_brax import config as configs
 from qdos_brax.config import Config
-from qdos_brax.config.methods import METHODS, Recipe
+from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.errors import UserError
@@ -71,7 +71,7 @@ class BuildContext(NamedTuple):
     """
 
     config: Config
-    method: Recipe
+    method: Method
     env: Any
     dataset: Dataset
     data: DeviceData
@@ -106,7 +106,7 @@ def build_phases(context: BuildContext) -> list[MemberPhase]:
     labelled = round(config.high_level.batch_size * config.high_level.offline_fraction) > 0
     guide = None if method.guide is None else _GUIDES[method.guide](config, env)
     return [
-        *_LOW_LEVEL[method.source].phases(context),
+        *_LOW_LEVEL[method.low_level].phases(context),
         *([] if guide is None else [_offline_phase(context, "guide", guide.learner, config.guide.updates)]),
         *([LabelPhase(config.skills.horizon, len(context.data.starts), low_level)] if labelled else []),
         OnlinePhase(
@@ -144,7 +144,7 @@ def bind_phases(phases: Sequence[MemberPhase], population: Population, data: Dev
 
 def make_low_level(config: Config, env: SpaceSizes) -> LowLevelPolicy:
     """Return the method's low-level policy; its parameters are what its phases learn."""
-    return _LOW_LEVEL[METHODS[config.method].source].make(config, env)
+    return _LOW_LEVEL[METHODS[config.method].low_level].make(config, env)
 
 
 class _LowLevelKind(NamedTuple):
@@ -283,7 +283,7 @@ def value_phase(config: Config, env: SpaceSizes, ends: np.ndarray) -> GraphPhase
     return ValuePhase(config, IQL(env.observation_size, env.action_size, config.values.hidden))
 
 
-def _weights(config: Config, method: Recipe, env: SpaceSizes) -> SegmentWeights:
+def _weights(config: Config, method: Method, env: SpaceSizes) -> SegmentWeights:
     if not method.weighted:
         return UniformWeights()
     if config.skills.advantage != "latent":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from qdos_brax.config import to_yaml
+from qdos_brax.config.schema import labelled
 from qdos_brax.report.curves import setting_colours
 from qdos_brax.report.elements import (
     PALETTE,
@@ -24,7 +25,7 @@ from qdos_brax.report.tables import Table
 
 # Columns of metrics.csv that say where a row belongs, or that other sections show.
 _NOT_MEASURES = {
-    "member", "seed", "alpha", "phase", "env_steps", "update", "status_ok", "first_goal_step", "eval/success",
+    "member", "seed", *labelled(), "phase", "env_steps", "update", "status_ok", "first_goal_step", "eval/success",
 }  # fmt: skip
 
 

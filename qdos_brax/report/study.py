@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from qdos_brax.config import Config, from_yaml, nearest
+from qdos_brax.config import Config, from_yaml, nearest, values_by_key
 from qdos_brax.config.schema import get, leaves
 from qdos_brax.errors import UserError
 from qdos_brax.runs import comparison
@@ -182,13 +182,12 @@ def _read_run(folder: RunFolder) -> Run:
 def _member(
     path: Path, summary: dict[str, Any], values: dict[str, Any], entry: dict[str, Any], rows: list[Row]
 ) -> Member:
-    own = {key: value for key, value in entry.items() if "." in key} | {"skills.alpha": entry["alpha"]}
     return Member(
         run=path,
         task=str(summary["env"]),
         method=str(summary["method"]),
         seed=int(entry["seed"]),
-        values=values | own,
+        values=values | values_by_key(entry),
         success=_number(entry["eval_success"]),
         first_goal=_number(entry["first_goal_step"]),
         frozen=entry["status"] != "ok",

@@ -20,7 +20,7 @@ import pytest
 from qdos_brax.commands.main import main
 from qdos_brax.commands.train import train_main
 from qdos_brax.data import download, sources
-from qdos_brax.data.sources import Source
+from qdos_brax.data.sources import PublicDataset
 from qdos_brax.errors import UserError
 
 NAME = "antmaze-medium-navigate-v0"
@@ -66,8 +66,8 @@ class Server(ThreadingHTTPServer):
         self.released = threading.Event()
 
     @property
-    def source(self) -> Source:
-        return Source(NAME, f"{NAME}.npz", (f"http://127.0.0.1:{self.server_address[1]}/original/{NAME}.npz",))
+    def source(self) -> PublicDataset:
+        return PublicDataset(NAME, f"{NAME}.npz", (f"http://127.0.0.1:{self.server_address[1]}/original/{NAME}.npz",))
 
 
 def tag(content: bytes) -> str:
@@ -251,7 +251,7 @@ def test_a_size_need_not_be_told(server: Server, folder: Path) -> None:
 def test_the_mirror_helps_out(server: Server, folder: Path) -> None:
     server.answers = [refusing(404), honest]
     original = server.source.urls[0]
-    source = Source(NAME, f"{NAME}.npz", (original, original.replace("original", "mirror")))
+    source = PublicDataset(NAME, f"{NAME}.npz", (original, original.replace("original", "mirror")))
     assert download.fetch(source, folder, PATIENCE).path.read_bytes() == server.content
     assert [path.split("/")[1] for path, _ in server.requests] == ["original", "mirror"]
 
@@ -274,7 +274,7 @@ def test_what_was_fetched_is_checked_ever_after(server: Server, folder: Path, tm
 
 def test_offline_is_one_line(folder: Path) -> None:
     """A port that nothing listens at."""
-    source = Source(NAME, f"{NAME}.npz", ("http://127.0.0.1:9/a.npz", "http://no-such-host.invalid/a.npz"))
+    source = PublicDataset(NAME, f"{NAME}.npz", ("http://127.0.0.1:9/a.npz", "http://no-such-host.invalid/a.npz"))
     with pytest.raises(UserError, match=r"no connection, Connection refused.*offline") as error:
         download.fetch(source, folder, PATIENCE)
     assert "\n" not in str(error.value) and names(folder) == set()

@@ -1,0 +1,166 @@
+"""From layers or a run's config.yaml to one checked Config, and back to YAML."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from qdos_brax.config import scan
+from qdos_brax.config.layers import Layer, flat, known_keys, known_method, merged, read_values, run_layers
+from qdos_brax.config.rules import choices_in, convert
+from qdos_brax.config.schema import Config, leaves, plain
+from qdos_brax.errors import UserError
+
+
+def load_config(
+    env: str, preset: str | None = None, flags: Mapping[str, Any] | None = None, sets: Sequence[str] = ()
+) -> Config:
+    """Return the configuration of a run.
+
+    Args:
+        env: the task's name or alias, as ``envs.get_spec`` knows it.
+        preset: name of a preset; None takes ``default_preset()``.
+        flags: values by dotted key, as the flags of the command line give them.
+        sets: "key=value" texts; they win over everything else.
+
+    Raises:
+        UserError: an unknown task, preset or key (the nearest is named), or a value out of its range.
+    """
+    return _drawn(merged(run_layers(env, preset, flags, sets)))
+
+
+def load_programs(
+    env: str, preset: str | None = None, flags: Mapping[str, Any] | None = None, sets: Sequence[str] = ()
+) -> dict[str, Config]:
+    """Return the configurations of several programs, as ``programs_of`` the layers of ``load_config``."""
+    return programs_of(run_layers(env, preset, flags, sets))
+
+
+def programs_of(layers: Sequence[Layer]) -> dict[str, Config]:
+    """Return the configurations of layers: the product of all values that shape the program.
+
+    Returns:
+        The configurations by the values that they do not share ("horizon-4_utd-5"); by "" if there is only one.
+
+    Raises:
+        UserError: a value is out of its range, two programs are the same, or ``--zip`` is given with several.
+    """
+    values = merged(layers)
+    chosen: dict[str, list[Any]] = {}
+    for key, field in leaves(Config):
+        if key in values and _splits(key, field):
+            options = choices_in(key, values[key], field.metadata["rule"])
+            if len(options) > 1:
+                chosen[key] = options
+    if chosen and values.get("scan.combine") == "zip":
+        raise UserError(f"--zip pairs values within one program; {next(iter(chosen))} shapes the program, give one")
+    last = [key.rpartition(".")[2] for key in chosen]
+    short = {key: name if last.count(name) == 1 else key for key, name in zip(chosen, last, strict=True)}
+    programs: dict[str, Config] = {}
+    for combination in itertools.product(*chosen.values()):
+        own = dict(zip(chosen, combination, strict=True))
+        name = "_".join(f"{short[key]}-{_file_name(value)}" for key, value in own.items())
+        if name in programs:
+            raise UserError(f"the same program is asked for twice: {name.replace('_', ', ')}")
+        programs[name] = _drawn(values | own)
+    return programs
+
+
+def from_yaml(path: str | Path) -> Config:
+    """Return the configuration that ``to_yaml`` wrote.
+
+    Raises:
+        UserError: the file cannot be read, or holds an unknown key or a wrong value.
+    """
+    return _build(read_values(Path(path)))
+
+
+def to_yaml(config: Config) -> str:
+    """Return the whole configuration as YAML text, in the order of the fields."""
+    return yaml.safe_dump(plain(config), sort_keys=False, default_flow_style=None, width=110)
+
+
+def replace(config: Config, **values: Any) -> Config:
+    """Return a checked copy with other values, by dotted key ("skills.alpha").
+
+    Raises:
+        UserError: a key is unknown, or a value is wrong.
+    """
+    return _build(flat(plain(config)) | known_keys(values, "replace()"))
+
+
+def config_hash(config: Config) -> str:
+    """Return 16 hex digits over everything that decides the result, which neither folders nor the ``run`` group do.
+
+    Values without effect are left out too, so that runs from before such a key existed can be read: the scan group if
+    it has its defaults, and the members per program if there is one member or no number was given.
+    """
+    content = plain(config)
+    for key in ("out", "dataset", "run"):
+        del content[key]
+    if config.scan == Config().scan:
+        del content["scan"]
+    if config.members_per_program == 0 or len(scan.members(config)) == 1:
+        del content["members_per_program"]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _splits(key: str, field: dataclasses.Field[Any]) -> bool:
+    """Return whether several values of the field make several programs."""
+    rule = field.metadata["rule"]
+    fixed = key.startswith(("run.", "scan.")) or key == "members_per_program"
+    free = rule.kind in ("path", "seeds") or (rule.kind == "text" and not rule.choices)
+    return not (field.metadata["scan"] or fixed or free)
+
+
+def _file_name(value: Any) -> str:
+    return "-".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _drawn(values: Mapping[str, Any]) -> Config:
+    """Return the configuration of merged values, its scan drawn and checked."""
+    config = _build(scan.drawn(values))
+    scan.check(config)
+    return config
+
+
+def _build(values: Mapping[str, Any]) -> Config:
+    """Return the Config of values by dotted key; absent ones keep their default."""
+    checked = {key: convert(key, values[key], field) for key, field in leaves(Config) if key in values}
+    groups: dict[str, dict[str, Any]] = {}
+    top: dict[str, Any] = {}
+    for key, value in checked.items():
+        group, dot, name = key.partition(".")
+        if dot:
+            groups.setdefault(group, {})[name] = value
+        else:
+            top[key] = value
+    for group, entries in groups.items():
+        top[group] = dataclasses.replace(getattr(Config(), group), **entries)
+    config = Config(**top)
+    _check_together(config)
+    return config
+
+
+def _check_together(config: Config) -> None:
+    """Check what no single field's rule can."""
+    known_method(config.method)
+    high = config.high_level
+    if high.target_subset > high.ensemble:
+        raise UserError(
+            f"high_level.target_subset ({high.target_subset}) must not exceed high_level.ensemble ({high.ensemble})"
+        )
+    if high.env_steps < config.skills.horizon * high.num_envs:
+        raise UserError(
+            f"high_level.env_steps ({high.env_steps}) is less than one macro step of every environment "
+            f"({config.skills.horizon} x {high.num_envs}); raise it with --steps"
+        )
+    if config.skills.advantage == "transition" and config.values.estimator == "graph":
+        raise UserError("skills.advantage=transition needs values.estimator=iql; on a graph it is the same as segment")

@@ -1,0 +1,80 @@
+"""Configuration of online learning: labels of the offline segments, the high-level policy, and its evaluation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from qdos_brax.config.rules import choice, count, number, rate, widths
+from qdos_brax.config.skill_groups import Scannable
+
+
+@dataclasses.dataclass(frozen=True)
+class LabelsConfig:
+    """Configure the pseudo-labels of the offline segments, and the novelty bonus."""
+
+    offline_reward: str = choice(
+        "data",
+        "reward of an offline macro transition: data (as recorded), min (the lowest possible) or pred (by the reward "
+        "model)",
+        "data",
+        "min",
+        "pred",
+    )
+    rnd_coefficient: Scannable = number(8.0, "weight of the random-network-distillation bonus; 0 turns it off")
+    bonus_rows: str = choice("all", "rows that get the bonus", "all", "online")
+    rnd_hidden: tuple[int, ...] = widths((256, 256, 256), "hidden layers of the bonus's two networks")
+    rnd_features: int = count(256, "output size of the bonus's two networks")
+    rnd_learning_rate: Scannable = rate(3e-4, "Adam learning rate of the bonus")
+    reward_hidden: tuple[int, ...] = widths((256, 256, 256), "hidden layers of the reward model")
+    reward_learning_rate: Scannable = rate(3e-4, "Adam learning rate of the reward model")
+    start_env_steps: int = count(10_000, "environment steps before bonus and reward model are trained", low=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class HighLevelConfig:
+    """Configure the high-level policy: SAC over skills, learned online."""
+
+    hidden: tuple[int, ...] = widths((256, 256, 256), "hidden layers of actor and critics")
+    ensemble: int = count(10, "number of critics")
+    target_subset: int = count(1, "critics drawn for the minimum in the target")
+    batch_size: int = count(256, "macro transitions per gradient step", low=2)
+    offline_fraction: float = number(0.5, "share of a batch taken from the labelled data", high=1.0, scan=False)
+    utd: int = count(20, "critic steps per macro step of experience")
+    learning_rate: Scannable = rate(3e-4, "Adam learning rate of actor, critics and temperature")
+    discount: Scannable = number(0.99, "discount per macro step", high=1.0)
+    target_rate: Scannable = number(0.005, "Polyak rate of the target critics", high=1.0, above=True)
+    value_scale: float = number(1.0, "Q per unit of a critic's output", above=True, scan=False)
+    init_temperature: Scannable = number(0.05, "first value of the entropy temperature", above=True)
+    regulariser: str = choice(
+        "entropy",
+        "what the temperature weighs: entropy (of the actor, SAC) or prior (the actor's divergence from the skill "
+        "prior, in the bootstrap value too; SPiRL, Pertsch et al. 2020)",
+        "entropy",
+        "prior",
+    )
+    target_entropy_scale: Scannable = number(
+        0.5, "(regulariser entropy) the target entropy is minus this times the width of the action"
+    )
+    target_divergence: Scannable = number(1.0, "(regulariser prior) target of KL(actor || skill prior), in nats")
+    latent_map: str = choice(
+        "arctanh",
+        "from the action u in (-1, 1) to the skill z: arctanh, box (z = latent_box * u) or prior (z = mean + "
+        "latent_box * standard deviation * u of the state prior)",
+        "arctanh",
+        "box",
+        "prior",
+    )
+    num_envs: int = count(1, "environments stepped side by side")
+    warmup_env_steps: int = count(
+        5_000, "first environment steps, in which the state prior acts instead of the actor", low=0
+    )
+    env_steps: int = count(200_000, "environment steps of the online phase, over all environments")
+    replay_capacity: int = count(1_000_000, "most macro transitions kept; a run allocates no more than it will play")
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalConfig:
+    """Configure the evaluation, which has environments of its own."""
+
+    episodes: int = count(20, "episodes per evaluation")
+    every_env_steps: int = count(10_000, "online environment steps between two evaluations")

@@ -1,0 +1,108 @@
+"""Configuration of what is learned from the data for QDOS: the data set, values of states, and skills."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from qdos_brax.config.rules import choice, count, flag, number, rate, widths
+
+Scannable = float | tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """Configure the data set that is collected when none is given."""
+
+    transitions: int = count(1_000_000, "environment steps to collect")
+    degraded_share: float = number(
+        0.5,
+        "share of the episodes with bad behaviour on purpose (heavy noise, wandering, failed attempts)",
+        high=1.0,
+        scan=False,
+    )
+    noise: float = number(
+        0.2, "standard deviation of the action noise in the other episodes (actions lie in [-1, 1])", scan=False
+    )
+    num_envs: int = count(64, "environments stepped side by side")
+    seed: int = count(
+        0, "seed of the collection, apart from the learner's, so that every seed learns from the same data", low=0
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ValuesConfig:
+    """Configure the values of states, from which the advantages of segments are computed."""
+
+    estimator: str = choice(
+        "graph",
+        "graph (undiscounted steps to success along shortest paths on a graph of logged states) or iql (implicit "
+        "Q-learning, as in the paper)",
+        "graph",
+        "iql",
+    )
+    slowness: float = number(
+        0.9,
+        "(graph) least autocorrelation over a segment of the features that the graph uses",
+        high=1.0,
+        scan=False,
+    )
+    max_nodes: int = count(20_000, "(graph) approximate number of logged states that become nodes")
+    neighbours: int = count(20, "(graph) jumps from each node to its nearest, and as many to those of other episodes")
+    jump_cost: float = number(
+        1.0, "(graph) cost of a jump, in units of the time in which the data changes as far", above=True, scan=False
+    )
+    hidden: tuple[int, ...] = widths((256, 256), "hidden layers of V and Q, and of the advantage of skills")
+    learning_rate: Scannable = rate(3e-4, "Adam learning rate of V, Q and the advantage of skills")
+    batch_size: int = count(256, "(iql) transitions per gradient step")
+    expectile: Scannable = number(0.9, "(iql) expectile tau of the regression of V", high=1.0, above=True)
+    discount: Scannable = number(0.99, "(iql) discount per environment step", high=1.0)
+    target_rate: Scannable = number(0.005, "(iql) Polyak rate of the target critic", high=1.0, above=True)
+    n_step: int = count(10, "(iql) environment steps of the bootstrapped return")
+    updates: int = count(100_000, "(iql) gradient steps", pretrain=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class SkillsConfig:
+    """Configure the advantage-weighted trajectory VAE and the mutual information of its skills."""
+
+    horizon: int = count(20, "environment steps H of a segment and of a macro step; 1 for methods without skills")
+    latent_dim: int = count(8, "size of the skill z")
+    encoder_hidden: int = count(256, "width of the bidirectional GRU (the posterior)")
+    encoder_layers: int = count(2, "layers of the bidirectional GRU")
+    decoder_hidden: tuple[int, ...] = widths((256, 256), "hidden layers of the low-level policy")
+    prior_hidden: tuple[int, ...] = widths((256, 256), "hidden layers of the state prior")
+    batch_size: int = count(256, "segments per gradient step")
+    learning_rate: Scannable = rate(3e-4)
+    kl_weight: Scannable = number(0.1, "beta, the weight of KL(posterior || prior)")
+    kl_weighted: bool = flag(
+        True, "whether the advantage weight multiplies the KL too (Algorithm 1 of the paper) or not (equation 4)"
+    )
+    advantage: str = choice(
+        "segment",
+        "estimator of a segment's advantage: segment (H-step return plus V(s_H) minus V(s_0)), latent (Q(s_0, z) - "
+        "V(s_0)) or transition (mean of Q(s_t, a_t) - V(s_t); with iql only, on a graph it equals segment)",
+        "segment",
+        "latent",
+        "transition",
+    )
+    advantage_scale: str = choice(
+        "rank",
+        "scale of the advantage A before the division by lambda: rank (normal scores, independent of the distribution "
+        "of A) or std (A over its standard deviation)",
+        "rank",
+        "std",
+    )
+    advantage_temperature: Scannable = number(1.0, "lambda in the weights exp(A / lambda)", above=True)
+    weight_clip: Scannable = number(20.0, "largest weight, after the batch's weights are scaled to mean 1", low=1.0)
+    alpha: Scannable = number(0.2, "weight of the mutual-information loss", label="alpha")
+    mi_rollout: str = choice(
+        "physics",
+        "where skills are rolled out for the mutual-information loss: physics (the simulator) or logged (the policy "
+        "along the data's states)",
+        "physics",
+        "logged",
+    )
+    mi_every: int = count(20, "gradient steps that use one batch of rollouts")
+    mi_batch: int = count(64, "rollouts per batch")
+    latent_box: Scannable = number(2.0, "half the side of the box that random skills are drawn from", above=True)
+    updates: int = count(500_000, "gradient steps", pretrain=True)
