@@ -72,11 +72,12 @@ def test_every_recipe_builds_its_phases(method: str) -> None:
 def test_every_recipe_has_values_for_every_family(method: str, family: str) -> None:
     """Published values are those of the configuration, and stand below the preset and ``--set``."""
     published = recipe_settings(method, family)
-    config = configs.load_config(family, "paper", {"method": method})
+    layers = configs.family_layers(family, method, "paper")
+    config = configs.from_layers(layers)
     for key, value in published.items():
         found = configs.schema.get(config, key)
         assert found == (tuple(value) if isinstance(value, list) else value), key
-    own = configs.load_config(family, "paper", {"method": method}, ["labels.rnd_coefficient=3"])
+    own = configs.from_layers([*layers, configs.Layer("--set", {"labels.rnd_coefficient": 3})])
     assert own.labels.rnd_coefficient == 3.0
 
 
@@ -87,7 +88,7 @@ def test_published_values() -> None:
     assert (maze["explore"].labels.rnd_coefficient, maze["rlpd"].labels.rnd_coefficient) == (2.0, 0.0)
     assert maze["trajectory-skills"].high_level.offline_fraction == 0.0
     assert (maze["diffusion-jsrl"].guide.ratio, maze["iql"].policy.inverse_temperature) == (0.9, 10.0)
-    kitchen = {method: configs.load_config("kitchen-mixed", "paper", {"method": method}) for method in METHODS}
+    kitchen = {method: configs.from_layers(configs.family_layers("kitchen", method, "paper")) for method in METHODS}
     assert kitchen["supe"].labels.offline_reward == kitchen["hilp"].labels.offline_reward == "pred"
     assert (kitchen["diffusion-jsrl"].guide.ratio, kitchen["iql"].values.expectile) == (0.75, 0.7)
 
