@@ -60,7 +60,7 @@ def test_a_key_shows_every_layer_that_set_it(capsys: pytest.CaptureFixture[str])
         ("dataset --preset cpu", "dataset = none  (set by default)"),
         ("method --preset cpu --method iql", "method = iql  (set by flag)"),
         ("env --preset cpu", "env = antmaze  (set by default)"),
-        ("preset", f"preset = {default_preset()}  (set by chosen for this machine)"),
+        ("preset", f"preset = {default_preset()}  (set by this machine's default)"),
     ],
 )
 def test_one_key(command: str, expected: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""Every method is a recipe that builds; flat methods learn, guide, go on after a crash, and are evaluated."""
+"""Every method builds; flat methods learn, guide, go on after a crash, and are evaluated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from qdos_brax import config as configs
 from qdos_brax.analysis.finished import evaluate_run
 from qdos_brax.commands.cli import train_main
 from qdos_brax.config.methods import METHODS
-from qdos_brax.config.methods import settings as recipe_settings
+from qdos_brax.config.methods import settings as method_settings
 from qdos_brax.errors import UserError
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.sac import SAC
@@ -49,7 +49,7 @@ PHASES = {
 
 def config_of(method: str, **values: Any) -> configs.Config:
     """The plane's configuration for a method."""
-    horizon = recipe_settings(method, "antmaze").get("skills.horizon", 5)
+    horizon = method_settings(method, "antmaze").get("skills.horizon", 5)
     return point_config(**{"method": method, "skills.horizon": horizon, "values.n_step": horizon} | values)
 
 
@@ -62,16 +62,16 @@ def test_every_method_of_the_issue_is_there() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_recipe_builds_its_phases(method: str) -> None:
+def test_every_method_builds_its_phases(method: str) -> None:
     phases = phases_of(config_of(method), point_dataset(20))
     assert [phase.name for phase in phases] == PHASES[method]
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("family", configs.families())
-def test_every_recipe_has_values_for_every_family(method: str, family: str) -> None:
+def test_every_method_has_values_for_every_family(method: str, family: str) -> None:
     """Published values are those of the configuration, and stand below the preset and ``--set``."""
-    published = recipe_settings(method, family)
+    published = method_settings(method, family)
     layers = configs.family_layers(family, method, "paper")
     config = configs.from_layers(layers)
     for key, value in published.items():
