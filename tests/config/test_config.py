@@ -85,10 +85,7 @@ families:
     flat = load_config("antmaze", "tiny", {"method": "explore"}, ["labels.rnd_coefficient=1"])
     assert flat.labels.offline_reward == "min"  # method over family and default
     assert flat.skills.horizon == 8  # preset over method
-    assert (flat.high_level.utd, config.high_level.utd) == (
-        3,
-        20,
-    )  # the preset's section for the kind of low-level policy
+    assert (flat.high_level.utd, config.high_level.utd) == (3, 20)  # the preset's section for the low-level policy
     # A section for the low-level policy, over it one for the family, over it the family's for the low-level policy.
     assert (config.high_level.discount, flat.high_level.discount) == (0.8, 0.7)
     assert load_config("antsoccer", "tiny", {"method": "explore"}).high_level.discount == 0.9
