@@ -50,7 +50,7 @@ def explain(key: str | None, layers: Sequence[Layer]) -> str:
     if not chosen:
         raise UserError(f"there is no key {key!r}{nearest(str(key), [*groups(), *known])}")
     programs = list(programs_of(layers).values())
-    return "\n".join(_lines(chosen, programs, layers, history=key in known))
+    return "\n".join(_lines(chosen, programs, layers, history=key in known)).lstrip()
 
 
 def _show(args: argparse.Namespace) -> int:

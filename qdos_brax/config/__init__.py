@@ -15,7 +15,16 @@ from __future__ import annotations
 
 from qdos_brax.config.baseline_groups import DiveOffConfig, GuideConfig, HilbertConfig, PolicyConfig
 from qdos_brax.config.layers import Layer, default_preset, families, family_layers, presets, run_layers
-from qdos_brax.config.load import config_hash, from_yaml, load_config, load_programs, programs_of, replace, to_yaml
+from qdos_brax.config.load import (
+    config_hash,
+    from_layers,
+    from_yaml,
+    load_config,
+    load_programs,
+    programs_of,
+    replace,
+    to_yaml,
+)
 from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig
 from qdos_brax.config.rules import nearest
 from qdos_brax.config.run_groups import RunConfig, ScanConfig
@@ -42,6 +51,7 @@ __all__ = [
     "default_preset",
     "families",
     "family_layers",
+    "from_layers",
     "from_yaml",
     "hyper_tree",
     "load_config",

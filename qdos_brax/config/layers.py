@@ -55,7 +55,7 @@ def run_layers(
     chosen = preset or default_preset()
     return [
         *family_layers(family, given.get("method", Config.method), chosen),
-        *([] if preset else [Layer("chosen for this machine", {"preset": chosen})]),
+        *([] if preset else [Layer("this machine's default", {"preset": chosen})]),
         Layer("flag", {key: value for key, value in (("env", env), ("preset", preset)) if value} | given),
         Layer("--set", dict(_parse_set(text) for text in sets)),
     ]

@@ -33,7 +33,16 @@ def load_config(
     Raises:
         UserError: an unknown task, preset or key (the nearest is named), or a value out of its range.
     """
-    return _drawn(merged(run_layers(env, preset, flags, sets)))
+    return from_layers(run_layers(env, preset, flags, sets))
+
+
+def from_layers(layers: Sequence[Layer]) -> Config:
+    """Return the configuration of layers over the defaults.
+
+    Raises:
+        UserError: a value is wrong.
+    """
+    return _drawn(merged(layers))
 
 
 def load_programs(

@@ -68,21 +68,21 @@ METHODS = {
     # Wilcoxson et al. 2025, "Leveraging Skills from Unlabeled Prior Data for Efficient Online Exploration". Their code
     # has skills.horizon=4, the comparison in the QDOS paper 20.
     "supe": Method(
-        "unweighted skills; the data without its rewards, novelty made up for (Wilcoxson et al. 2025)",
+        "unweighted skills; the data without its rewards, plus a novelty bonus (Wilcoxson et al. 2025)",
         settings=_UNLABELLED,
         by_family=_UNLABELLED_BY_FAMILY,
     ),
     # Ajay et al. 2021 (OPAL), Pertsch et al. 2020 (SPiRL: with high_level.regulariser=prior); online as in
     # Wilcoxson et al. 2025, "online w/ trajectory skills".
     "trajectory-skills": Method(
-        "SUPE's skills, learned with online alone (OPAL, Ajay et al. 2021; SPiRL, Pertsch et al. 2020)",
+        "SUPE's skills; the high level learns without the data (OPAL, Ajay et al. 2021; SPiRL, Pertsch et al. 2020)",
         settings=_ONLINE_ONLY,
         # SPiRL's target divergence: 1 in the maze, 5 in the kitchen (appendix).
         by_family={family: {"high_level.target_divergence": 5.0} for family in _MANIPULATION},
     ),
     # Li et al. 2023, "Accelerating exploration with unlabeled prior data"; the coefficient as SUPE's authors run it.
     "explore": Method(
-        "no skills; the data without its rewards, novelty made up for (ExPLORe, Li et al. 2023)",
+        "no skills; the data without its rewards, plus a novelty bonus (ExPLORe, Li et al. 2023)",
         low_level="action",
         settings=_FLAT | _UNLABELLED | {"labels.rnd_coefficient": 2.0},
         by_family=_UNLABELLED_BY_FAMILY,
@@ -95,13 +95,13 @@ METHODS = {
     ),
     # Park et al. 2024, "Foundation policies with Hilbert representations"; online as in Wilcoxson et al. 2025.
     "hilp": Method(
-        "directions in a Hilbert representation as skills, online as SUPE (HILP, Park et al. 2024)",
+        "directions in a Hilbert representation as skills; online as SUPE (HILP, Park et al. 2024)",
         low_level="direction",
         settings=_UNLABELLED | _DIRECTIONS,
         by_family=_UNLABELLED_BY_FAMILY,
     ),
     "hilp-online": Method(
-        "HILP's skills, learned with online alone",
+        "HILP's skills; the high level learns without the data",
         low_level="direction",
         settings=_ONLINE_ONLY | _DIRECTIONS,
     ),
@@ -117,14 +117,14 @@ METHODS = {
     # Kostrikov et al. 2022, "Offline reinforcement learning with implicit Q-learning": expectile 0.9 and beta 10 in
     # mazes, 0.7 and 0.5 in the kitchen; Park et al. 2025 (OGBench): 0.9 and 10.
     "iql": Method(
-        "no skills, offline alone: implicit Q-learning (Kostrikov et al. 2022)",
+        "no skills, learned offline only: implicit Q-learning (Kostrikov et al. 2022)",
         low_level="action",
         policy="iql",
         settings=_FLAT | {"values.estimator": "iql", "values.expectile": 0.9, "policy.inverse_temperature": 10.0},
         by_family=_OFFLINE_WIDTHS | {"kitchen": {"values.expectile": 0.7, "policy.inverse_temperature": 0.5}},
     ),
     "bc": Method(
-        "no skills, offline alone: behaviour cloning",
+        "no skills, learned offline only: behaviour cloning",
         low_level="action",
         policy="bc",
         settings=_FLAT,

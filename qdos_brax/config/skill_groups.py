@@ -94,7 +94,9 @@ class SkillsConfig:
     )
     advantage_temperature: Scannable = number(1.0, "lambda in the weights exp(A / lambda)", above=True)
     weight_clip: Scannable = number(20.0, "largest weight, after the batch's weights are scaled to mean 1", low=1.0)
-    alpha: Scannable = number(0.2, "weight of the mutual-information loss", label="alpha")
+    alpha: Scannable = number(
+        0.2, "weight of the mutual-information loss; methods without that loss run with 0", label="alpha"
+    )
     mi_rollout: str = choice(
         "physics",
         "where skills are rolled out for the mutual-information loss: physics (the simulator) or logged (the policy "

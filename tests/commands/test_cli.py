@@ -55,6 +55,7 @@ def test_help_waits_for_no_jax(call: str) -> None:
         ("--env antmaze --preset cpu --steps 0", "high_level.env_steps must be at least 1"),
         ("--env antmaze --preset cpu --physics mujco", "did you mean 'mujoco'"),
         ("--env antmaze --preset cpu --method qdso", "did you mean 'qdos'"),
+        ("--env cube-single", "no task 'cube-single'; did you mean"),
         ("--env antmaze-huge --preset cpu", "no task 'antmaze-huge'; did you mean"),
         ("--env antmaze --preset cpu --dataset /nowhere.npz --out {tmp}/run", "/nowhere.npz: no such file"),
     ],
@@ -76,6 +77,7 @@ def test_flags_reach_the_configuration() -> None:
     assert config.skills.alpha == (0.1, 0.3) and config.skills.kl_weight == 0.2
     assert (config.high_level.env_steps, config.eval.episodes) == (4000, 3)
     assert config.values.updates == config.skills.updates == 70
+    assert config.policy.updates == config.guide.updates == config.hilbert.updates == config.diveoff.updates == 70
 
 
 def test_tasks_are_listed(capsys: pytest.CaptureFixture[str]) -> None:

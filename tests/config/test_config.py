@@ -27,11 +27,32 @@ def every_family_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("preset", configs.presets())
 @pytest.mark.parametrize("family", configs.families())
 def test_every_family_loads_with_every_preset(family: str, preset: str, tmp_path: Path) -> None:
-    config = load_config(family, preset)
+    config = configs.from_layers(configs.family_layers(family, "qdos", preset))
     path = tmp_path / "config.yaml"
     path.write_text(configs.to_yaml(config))
     assert configs.from_yaml(path) == config
     assert hash(config) == hash(configs.from_yaml(path))
+
+
+@pytest.mark.parametrize("name", [*envs.ALIASES, *dict.fromkeys(spec.name for spec in envs.list_tasks())])
+def test_every_task_takes_the_layers_of_its_family(name: str) -> None:
+    family = envs.get_spec(name).family
+    layers = configs.run_layers(name, "paper")
+    assert layers[0].name == f"configs/{family}.yaml" and layers[0].values["skills.alpha"] == 0.3
+    assert load_config(name, "paper").env == name
+
+
+def test_every_registered_family_has_a_yaml() -> None:
+    assert set(envs.FAMILIES) <= set(configs.families())
+
+
+def test_a_family_without_a_yaml_takes_the_defaults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "presets").mkdir()
+    (tmp_path / "presets" / "tiny.yaml").write_text("families: {antmaze: {skills: {horizon: 7}}}")
+    monkeypatch.setattr(configs.layers, "CONFIG_DIR", tmp_path)
+    config = load_config("antmaze", "tiny")
+    assert config.skills.horizon == 7
+    assert configs.replace(config, preset="paper", **{"skills.horizon": 20}) == Config(env="antmaze")
 
 
 def test_the_papers_values() -> None:
@@ -40,12 +61,13 @@ def test_the_papers_values() -> None:
     assert (maze.skills.encoder_hidden, maze.skills.encoder_layers) == (256, 2)
     assert soccer.high_level.hidden == (512, 512, 512) and maze.high_level.hidden == (256, 256, 256)
     assert soccer.high_level.discount == soccer.values.discount == 0.995 and maze.high_level.discount == 0.99
-    assert load_config("scene", "paper").skills.kl_weight == 0.2 and maze.skills.kl_weight == 0.1
+    scene = configs.from_layers(configs.family_layers("scene", "qdos", "paper"))
+    assert scene.skills.kl_weight == 0.2 and maze.skills.kl_weight == 0.1
     for config in (soccer, maze):
         assert (config.skills.horizon, config.skills.latent_dim, config.skills.batch_size) == (20, 8, 256)
         assert (config.high_level.ensemble, config.high_level.utd, config.high_level.batch_size) == (10, 20, 256)
         assert (config.values.expectile, config.labels.rnd_coefficient) == (0.9, 8.0)
-    kitchen = load_config("kitchen-mixed", "paper").high_level
+    kitchen = configs.from_layers(configs.family_layers("kitchen", "qdos", "paper")).high_level
     assert (kitchen.target_subset, kitchen.init_temperature) == (2, 1.0)
 
 
@@ -55,12 +77,12 @@ def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (tmp_path / "antsoccer.yaml").write_text("")
     preset = """
 skills: {alpha: 0.4, kl_weight: 0.5, horizon: 8}
-sources: {action: {high_level: {utd: 3, discount: 0.9}}}
+low_level: {action: {high_level: {utd: 3, discount: 0.9}}}
 families:
   antmaze:
     skills: {kl_weight: 0.6}
     high_level: {discount: 0.8}
-    sources: {action: {high_level: {discount: 0.7}}}
+    low_level: {action: {high_level: {discount: 0.7}}}
 """
     (tmp_path / "presets" / "tiny.yaml").write_text(preset)
     monkeypatch.setattr(configs.layers, "CONFIG_DIR", tmp_path)
@@ -71,13 +93,13 @@ families:
     assert config.skills.alpha == 0.8  # --set over flag
     assert load_config("antsoccer", "tiny").skills.kl_weight == 0.5
     flat = load_config("antmaze", "tiny", {"method": "explore"}, ["labels.rnd_coefficient=1"])
-    assert flat.labels.offline_reward == "min"  # recipe over family and default
-    assert flat.skills.horizon == 8  # preset over recipe
-    assert (flat.high_level.utd, config.high_level.utd) == (3, 20)  # the preset's section for the recipe's source
-    # A section for the source, over it one for the family, over it the family's for the source.
+    assert flat.labels.offline_reward == "min"  # method over family and default
+    assert flat.skills.horizon == 8  # preset over method
+    assert (flat.high_level.utd, config.high_level.utd) == (3, 20)  # the preset's section for the low-level policy
+    # A section for the low-level policy, over it one for the family, over it the family's for the low-level policy.
     assert (config.high_level.discount, flat.high_level.discount) == (0.8, 0.7)
     assert load_config("antsoccer", "tiny", {"method": "explore"}).high_level.discount == 0.9
-    assert flat.labels.rnd_coefficient == 1.0  # --set over recipe
+    assert flat.labels.rnd_coefficient == 1.0  # --set over method
 
 
 def _written(value: object) -> str:
@@ -133,6 +155,10 @@ def test_wrong_settings_are_one_line(text: str, message: str) -> None:
 def test_unknown_names_propose_the_nearest() -> None:
     with pytest.raises(UserError, match="did you mean 'antmaze-large'"):
         load_config("antmase-large", "cpu")
+    for name in ("cube-single", "kitchen", "antmaze-huge", "antmaze-medium-task9"):  # a YAML alone makes no task
+        with pytest.raises(UserError, match=f"there is no task '{name}'") as caught:
+            configs.load_programs(name, "cpu")
+        assert "\n" not in str(caught.value)
     with pytest.raises(UserError, match="did you mean 'smoke'"):
         load_config("antmaze", "smokey")
 
@@ -276,10 +302,46 @@ def test_frozen() -> None:
         Config().env = "antsoccer"  # type: ignore[misc]
 
 
-def test_every_field_is_documented() -> None:
-    for group in (
-        Config,
-        *(type(f.default) for f in dataclasses.fields(Config) if dataclasses.is_dataclass(f.default)),
-    ):
-        for field in dataclasses.fields(group):
-            assert f"        {field.name}: " in (group.__doc__ or ""), f"{group.__name__}.{field.name}"
+def test_every_field_says_what_it_means() -> None:
+    for key, field in schema.leaves(Config):
+        assert len(field.metadata["meaning"]) > 10, key
+    for name, purpose in schema.groups().items():
+        assert purpose.startswith("Configure ") and "\n" not in purpose, name
+
+
+def test_layers_keep_their_names() -> None:
+    layers = configs.run_layers("antsoccer", "cpu", {"method": "rlpd", "skills.alpha": 1}, ["high_level.utd=3"])
+    assert [layer.name for layer in layers] == [
+        "configs/antsoccer.yaml",
+        "method rlpd",
+        "preset cpu",
+        "preset cpu, section low_level.action",
+        "preset cpu, section families.antsoccer",
+        "preset cpu, section families.antsoccer.low_level.action",
+        "flag",
+        "--set",
+    ]
+    by_name = {layer.name: layer.values for layer in layers}
+    assert by_name["preset cpu, section families.antsoccer.low_level.action"] == {"high_level.discount": 0.995}
+    assert by_name["flag"] == {"env": "antsoccer", "preset": "cpu", "method": "rlpd", "skills.alpha": 1}
+    assert by_name["--set"] == {"high_level.utd": 3}
+    unnamed = configs.run_layers("antsoccer")
+    assert {"preset": configs.default_preset()} in [layer.values for layer in unnamed]
+
+
+def test_a_member_keeps_the_value_of_a_labelled_key_under_its_label() -> None:
+    """The schema marks the label; a member has it also where it does not vary, and the dotted key finds the value."""
+    assert schema.labelled() == {"alpha": "skills.alpha"}
+    config = load_config("antmaze", "smoke", {"skills.alpha": "0.1,0.2"}, ["skills.kl_weight=1,2"])
+    member = configs.members(config)[3]
+    assert member == {"seed": 0, "alpha": 0.2, "skills.kl_weight": 2.0}
+    assert configs.values_by_key(member) == {"skills.alpha": 0.2, "skills.kl_weight": 2.0}
+    with pytest.raises(KeyError, match="alpha"):
+        configs.values_by_key({"seed": 0})
+
+
+def test_pretrain_steps_are_marked_in_the_schema() -> None:
+    """Every group that learns from the data alone has its budget under the mark, and no other key."""
+    groups = ("values", "skills", "policy", "guide", "hilbert", "diveoff")
+    assert schema.pretrain_keys() == [f"{group}.updates" for group in groups]
+    assert [key for key, _ in schema.leaves(Config) if key.endswith(".updates")] == schema.pretrain_keys()

@@ -1,4 +1,4 @@
-"""Every method is a recipe that builds; flat methods learn, guide, go on after a crash, and are evaluated."""
+"""Every method builds; flat methods learn, guide, go on after a crash, and are evaluated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from qdos_brax import config as configs
 from qdos_brax.analysis.finished import evaluate_run
 from qdos_brax.commands.train import train_main
 from qdos_brax.config.methods import METHODS
-from qdos_brax.config.methods import settings as recipe_settings
+from qdos_brax.config.methods import settings as method_settings
 from qdos_brax.data.device import to_device
 from qdos_brax.data.transitions import Transition
 from qdos_brax.errors import UserError
@@ -64,7 +64,7 @@ PHASES = {
 
 def config_of(method: str, **values: Any) -> configs.Config:
     """The plane's configuration for a method."""
-    horizon = recipe_settings(method, "antmaze").get("skills.horizon", 5)
+    horizon = method_settings(method, "antmaze").get("skills.horizon", 5)
     return point_config(**{"method": method, "skills.horizon": horizon, "values.n_step": horizon} | values)
 
 
@@ -78,21 +78,22 @@ def test_every_method_of_the_issue_is_there() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_recipe_builds_its_phases(method: str) -> None:
+def test_every_method_builds_its_phases(method: str) -> None:
     phases = phases_of(config_of(method), point_dataset(20))
     assert [phase.name for phase in phases] == PHASES[method]
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("family", configs.families())
-def test_every_recipe_has_values_for_every_family(method: str, family: str) -> None:
+def test_every_method_has_values_for_every_family(method: str, family: str) -> None:
     """Published values are those of the configuration, and stand below the preset and ``--set``."""
-    published = recipe_settings(method, family)
-    config = configs.load_config(family, "paper", {"method": method})
+    published = method_settings(method, family)
+    layers = configs.family_layers(family, method, "paper")
+    config = configs.from_layers(layers)
     for key, value in published.items():
         found = configs.schema.get(config, key)
         assert found == (tuple(value) if isinstance(value, list) else value), key
-    own = configs.load_config(family, "paper", {"method": method}, ["labels.rnd_coefficient=3"])
+    own = configs.from_layers([*layers, configs.Layer("--set", {"labels.rnd_coefficient": 3})])
     assert own.labels.rnd_coefficient == 3.0
 
 
@@ -103,7 +104,7 @@ def test_published_values() -> None:
     assert (maze["explore"].labels.rnd_coefficient, maze["rlpd"].labels.rnd_coefficient) == (2.0, 0.0)
     assert maze["trajectory-skills"].high_level.offline_fraction == 0.0
     assert (maze["diffusion-jsrl"].guide.ratio, maze["iql"].policy.inverse_temperature) == (0.9, 10.0)
-    kitchen = {method: configs.load_config("kitchen-mixed", "paper", {"method": method}) for method in METHODS}
+    kitchen = {method: configs.from_layers(configs.family_layers("kitchen", method, "paper")) for method in METHODS}
     assert kitchen["supe"].labels.offline_reward == kitchen["hilp"].labels.offline_reward == "pred"
     assert (kitchen["diffusion-jsrl"].guide.ratio, kitchen["iql"].values.expectile) == (0.75, 0.7)
 
