@@ -1,4 +1,4 @@
-"""Several methods in one command: one after another, each in its run folder, gone on with after a kill."""
+"""Several methods in one command: one after another, each in its run folder, resumed after a kill."""
 
 from __future__ import annotations
 

@@ -30,18 +30,18 @@ def test_a_scan_of_two_from_flags_to_page(
     calls = {name: counted(monkeypatch, module, name) for module, name in ((formats, "read"), (experiment, "sha256"))}
     monkeypatch.setattr(conclusion, "load_run", refuse)  # what is in memory is not read again
     assert train_main(shlex.split(f"{TINY} --alpha 0.1,0.3 --seed 0,1 --zip --out {run}")) == 0
-    said = capsys.readouterr().out
-    assert "members   2 members, " in said and "done in" in said
+    printed = capsys.readouterr().out
+    assert "members   2 members, " in printed and "done in" in printed
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     assert [(member["seed"], member["alpha"]) for member in summary["members"]] == [(0, 0.1), (1, 0.3)]
     assert calls == {"read": [1], "sha256": [1]} and (run / "inside.npz").exists()
-    assert f"  alpha 0.3, seed 1: success {summary['members'][1]['eval_success']:.2f} (best " in said
+    assert f"  alpha 0.3, seed 1: success {summary['members'][1]['eval_success']:.2f} (best " in printed
     assert all(member["status"] == "ok" and member["env_steps"] == 160 for member in summary["members"])
     with (run / "metrics.csv").open(newline="") as file:
         phases = {row["phase"] for row in csv.DictReader(file)}
     assert phases == {"values", "skills", "label", "online"}
     assert (run / "report.html").stat().st_size > 0 and any((run / "tensorboard").rglob("events*"))
-    assert train_main(["--resume", str(run)]) == 0  # it has ended: said, not done again
+    assert train_main(["--resume", str(run)]) == 0  # it has finished: not run again
     assert "has finished already" in capsys.readouterr().out
 
 

@@ -1,4 +1,4 @@
-"""A sweep on Ray Tune: what a trial runs and what it tells; and, where Ray is installed, a whole one."""
+"""A sweep on Ray Tune: what a trial runs and reports; and, where Ray is installed, a whole sweep."""
 
 from __future__ import annotations
 

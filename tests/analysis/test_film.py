@@ -30,7 +30,7 @@ def main(command: str) -> int:
 
 
 def read(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[dict, np.ndarray]:
-    """What ffmpeg says of a film, and its frames uint8[T, height, width, 3]."""
+    """Return ffmpeg's description of a film, and its frames uint8[T, height, width, 3]."""
     # Without this it runs Python between fork and exec, where JAX's threads can hang it.
     monkeypatch.setenv("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
     reader = imageio_ffmpeg.read_frames(path)

@@ -49,7 +49,7 @@ def data() -> Dataset:
 
 
 @pytest.fixture
-def looked(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Path:
+def analysed(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An analysed run; its second segment is worth ten times as much as the others."""
     monkeypatch.setattr(inside, "_FRAME_HEIGHT", 48)
     trained = finished_runs.load_run(finished)
@@ -60,8 +60,8 @@ def looked(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 @pytest.mark.slow
-def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
-    with np.load(looked / "inside.npz", allow_pickle=False) as file:
+def test_inside_and_its_page(analysed: Path, opengl_or_not: bool) -> None:
+    with np.load(analysed / "inside.npz", allow_pickle=False) as file:
         found = dict(file)
     assert found["members"].tolist() == [0]  # the other has the same setting and another seed
     segments = 3 * (20 - HORIZON + 1)
@@ -89,8 +89,8 @@ def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
     if opengl_or_not:
         assert found["0/frames"].shape == (6, 48, 48, 3) and found["0/frame_steps"].tolist() == [0, 5, 10, 15, 20, 25]
 
-    written_as_finished(looked)
-    study = read_study([looked])
+    written_as_finished(analysed)
+    study = read_study([analysed])
     analyses, _ = read_analyses(study)
     sections = {section.title: section for section in analysis_sections(analyses)}
     titles = ["Weight against quality", "Latents of segments (t-SNE)", "Where skills lead", "Skills over an episode"]
@@ -100,10 +100,10 @@ def test_inside_and_its_page(looked: Path, opengl_or_not: bool) -> None:
     assert dots[0]["y"][1] == pytest.approx(10 / mean, rel=1e-4)
     assert len(sections["Where skills lead"].figures[0].data) == 25 + 1
     assert len(sections["Skills over an episode"].subsections[0].images) == (6 if opengl_or_not else 0)
-    write_page(study, analyses, looked / "report.html")
-    assert (looked / "report.html").read_text().count("data:image/jpeg;base64,") == (6 if opengl_or_not else 0)
+    write_page(study, analyses, analysed / "report.html")
+    assert (analysed / "report.html").read_text().count("data:image/jpeg;base64,") == (6 if opengl_or_not else 0)
 
-    (looked / "inside.npz").write_bytes((looked / "inside.npz").read_bytes()[:1000])
+    (analysed / "inside.npz").write_bytes((analysed / "inside.npz").read_bytes()[:1000])
     assert read_analyses(study)[0] == [] and "delete it" in read_analyses(study)[1][0]
 
 

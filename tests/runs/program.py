@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens on."""
+    """Return a free port of this machine."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port: int = free.getsockname()[1]
@@ -23,7 +23,7 @@ def free_port() -> int:
 
 
 def launch(data: Path, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
-    """The program, with its own folder for data and for what it says."""
+    """Start the program with its own folders for data and output."""
     data.mkdir(exist_ok=True)
     env = {**os.environ, "QDOS_DATA": str(data), "PYTHONPATH": str(ROOT), **environment}
     with (data / "log").open("wb") as log:
@@ -31,25 +31,25 @@ def launch(data: Path, *arguments: str, **environment: str) -> subprocess.Popen[
 
 
 def wait_for_start(process: subprocess.Popen[bytes], data: Path) -> float:
-    """The time when the program had said its first line, after its imports."""
+    """Return the time when the program had printed its first line, after its imports."""
     deadline = time.monotonic() + 300
     while not (data / "log").stat().st_size:
-        assert process.poll() is None and time.monotonic() < deadline, "it has not begun"
+        assert process.poll() is None and time.monotonic() < deadline, "it has not started"
         time.sleep(0.02)
     return time.monotonic()
 
 
 def place(path: Path, data: Path) -> str:
-    """Where a kill came: the last row and the last line said."""
+    """Return where a kill hit: the last rows, and the last line that was printed."""
     last = [
         f"{file.parent.name} {rows(file.parent)[-1]['phase']}"
         for file in path.rglob("metrics.csv")
         if rows(file.parent)
     ]
     lines = (data / "log").read_text(errors="replace").replace("\r", "\n").split("\n")
-    said = next((line for line in reversed(lines) if line.strip()), "")
+    printed = next((line for line in reversed(lines) if line.strip()), "")
     ended = " ended" if list(path.rglob("summary.json")) else ""
-    return f"rows of {', '.join(last) or 'nothing'}{ended}; last line: {said[:60]}"
+    return f"rows of {', '.join(last) or 'nothing'}{ended}; last line: {printed[:60]}"
 
 
 def assert_same_end(path: Path, whole: Path) -> None:

@@ -56,7 +56,7 @@ def test_a_small_run_killed_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     ids=["run", "comparison"],
 )
 def test_kill_9_at_random_moments(tmp_path: Path, flags: list[str], kills: int) -> None:
-    """Runs are killed and gone on with until they end, and new ones begun, until there were enough kills.
+    """Runs are killed and resumed until they finish, and new ones started, until there were enough kills.
 
     A moment is drawn from the whole time between the first line of the program and its end: collection of the data
     (each run collects its own), every phase, and the report. Most of a resumed run is behind it, so many runs end.
@@ -90,13 +90,13 @@ def test_kill_9_at_random_moments(tmp_path: Path, flags: list[str], kills: int) 
 
 
 def drawn_seed() -> int:
-    """A seed that nobody chose, said so that a failure can be had again."""
+    """Return a random seed and print it, so that a failure can be reproduced."""
     seed = int(os.environ.get("QDOS_KILL_SEED") or time.time_ns() % 2**32)
     print(f"QDOS_KILL_SEED={seed}")
     return seed
 
 
 def arguments(path: Path, flags: list[str]) -> list[str]:
-    """What goes on in ``path``, or begins there."""
+    """Return the flags that resume the run in ``path``, or start it there."""
     begun = (path / "config.yaml").exists() or (path / "comparison.json").exists()
     return ["--resume", str(path)] if begun else [*flags, "--out", str(path)]

@@ -26,7 +26,7 @@ CONFIG = "0123456789abcdef"
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run that nobody disturbed."""
+    """Return the folder of an undisturbed run."""
     path = tmp_path_factory.mktemp("whole") / "run"
     toy.run(path)
     return path
