@@ -289,3 +289,13 @@ def test_next_observations_show_where_episodes_end(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.flatnonzero(rows.ends), [8, 15, 23])
     np.testing.assert_array_equal(rows.next_observations, following)
     assert rows.size == 24
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("following", [True, False])
+def test_files_with_hardly_any_rows_are_read(tmp_path: Path, count: int, following: bool) -> None:
+    columns = {"observations": np.zeros((count, 29)), "actions": np.zeros((count, 8)), "terminals": np.zeros(count)}
+    if following:
+        columns["next_observations"] = np.zeros((count, 29))
+    rows = formats.load(write_d4rl(tmp_path / "few.hdf5", columns))
+    assert rows.size == (count if following else 0)

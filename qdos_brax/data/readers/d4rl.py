@@ -89,7 +89,7 @@ def load(path: Path, jump: float | None) -> Rows:
 def _breaks(observations: np.ndarray, following: np.ndarray) -> np.ndarray:
     """Return bool[N]: the next observation is not the next row's."""
     breaks = np.zeros(len(observations), bool)
-    if observations.shape == following.shape:  # else the sizes are reported by the checks
+    if len(breaks) > 1 and observations.shape == following.shape:  # else the sizes are reported by the checks
         breaks[:-1] = np.abs(observations[1:] - following[:-1]).reshape(len(breaks) - 1, -1).max(axis=1) > 1e-6
     return breaks
 
