@@ -304,7 +304,8 @@ def _async_reset(options: str) -> subprocess.CompletedProcess[str]:
     program = (
         "import gymnasium, envs.gym_api\n"
         "if __name__ == '__main__':\n"
-        f"    batch = gymnasium.make_vec({MEDIUM!r}, num_envs=2, vectorization_mode='async', physics='mujoco'{options})\n"
+        f"    options = dict(num_envs=2, vectorization_mode='async', physics='mujoco'{options})\n"
+        f"    batch = gymnasium.make_vec({MEDIUM!r}, **options)\n"
         "    print(batch.reset(seed=0)[0].shape)\n"
         "    batch.close()\n"
     )

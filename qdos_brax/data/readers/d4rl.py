@@ -42,7 +42,7 @@ def load(path: Path, jump: float | None) -> Rows:
     Episode ends are checked, not trusted: ant mazes of version 0 have ``timeouts`` out of step, those of version 2
     mark every row at the goal as terminal although the episode goes on, the kitchen has no ``timeouts`` and marks the
     last row of every demonstration as terminal, solved or not. Without next observations the last row of an episode
-    is only a next state.
+    is only a next state, unless it is terminal.
 
     Raises:
         UserError: unreadable, incomplete, or sizes that do not fit.
@@ -64,10 +64,15 @@ def load(path: Path, jump: float | None) -> Rows:
             ends[-1] = True
             _note_breaks(notes, marked, breaks)
         if "next_observations" not in table:
-            keep, is_next = ~ends, np.roll(~ends, 1)
-            observations, following = observations[keep], observations[is_next]
-            ends = np.roll(ends, -1)[keep]
+            # A last row without a next state is of use where the task terminates in it: labelling decides.
+            last_kept = ends & terminals
+            keep = ~ends | last_kept
+            following = observations[np.where(ends, np.arange(len(ends)), np.arange(1, len(ends) + 1))[keep]]
+            unknown = last_kept[keep]
+            ends = (ends | np.roll(ends & ~last_kept, -1))[keep]
+            observations = observations[keep]
         rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes)
+        rows.unknown_next = None if keep is None else unknown
         rows.terminals = terminals.astype(np.float32) if keep is None else terminals[keep].astype(np.float32)
         for key in ("qpos", "qvel"):
             if f"infos/{key}" in table:
@@ -81,6 +86,8 @@ def load(path: Path, jump: float | None) -> Rows:
             rows.quality = quality if keep is None else quality[keep]
         if _KITCHEN.fits(table, rows):
             rows.terminals = np.asarray(rows.rewards == _KITCHEN.rewards[-1], np.float32)
+            if rows.unknown_next is not None:
+                rows.drop(rows.unknown_next)
             notes.append("no timeouts: demonstrations end at their terminals, and only four complete tasks terminate")
         after_action(path, rows)
         return rows
