@@ -318,3 +318,11 @@ def test_d4rl_terminal_last_rows_are_kept_where_the_task_ends(tmp_path: Path, st
     np.testing.assert_array_equal(np.flatnonzero(labelled.ends), [7, 13, 20] if states else [8, 15, 23])
     np.testing.assert_array_equal(labelled.masks == 0, np.zeros(21, bool) if states else columns["terminals"])
     assert f"{0 if states else 3} are kept and {3 if states else 0} dropped" in rows.notes[-1]
+
+
+def test_rounded_next_observations_are_named(tmp_path: Path) -> None:
+    columns = d4rl_antmaze()
+    following = np.concatenate([columns["infos/qpos"], columns["infos/qvel"]], axis=1)
+    columns["next_observations"] = following.astype(np.float16)
+    with pytest.raises(UserError, match=r"next_observations do not match .*by up to \S+ in a typical one"):
+        formats.load(write_d4rl(tmp_path / "a.hdf5", columns))

@@ -9,6 +9,7 @@ import numpy as np
 
 from qdos_brax.data.readers.rows import Rows, after_action, unreadable
 from qdos_brax.data.readers.table import DataTable, HDF5Table
+from qdos_brax.errors import UserError
 
 _OPTIONAL = ("next_observations", "rewards", "timeouts", "infos/qpos", "infos/qvel", "infos/extra", "infos/quality")
 
@@ -57,6 +58,7 @@ def load(path: Path, jump: float | None) -> Rows:
         if "next_observations" in table:
             (following,) = table.floats("next_observations", None)
             breaks = _breaks(observations, following)
+            _require_same_precision(path, observations, following, breaks)
         else:
             breaks = _jumps(observations, jump if "infos/qpos" in table else None)
         ends = marked | breaks
@@ -99,6 +101,20 @@ def _breaks(observations: np.ndarray, following: np.ndarray) -> np.ndarray:
     if len(breaks) > 1 and observations.shape == following.shape:  # else the sizes are reported by the checks
         breaks[:-1] = np.abs(observations[1:] - following[:-1]).reshape(len(breaks) - 1, -1).max(axis=1) > 1e-6
     return breaks
+
+
+def _require_same_precision(path: Path, observations: np.ndarray, following: np.ndarray, breaks: np.ndarray) -> None:
+    """Raise UserError where most next observations are nearly, not exactly, the next row's: they were rounded."""
+    if len(breaks) < 2 or breaks.mean() <= 0.5:
+        return
+    apart = np.abs(observations[1:] - following[:-1])[breaks[:-1]]
+    limit = 2.0**-10 * np.abs(observations[1:])[breaks[:-1]] + 1e-6  # float16 rounds to within half of it
+    if (apart <= limit).reshape(len(apart), -1).all(axis=1).mean() > 0.5:
+        raise UserError(
+            f"{path}: next_observations do not match the next row's observations in {breaks.sum()} of {len(breaks)} "
+            f"rows, by up to {np.median(apart.reshape(len(apart), -1).max(axis=1)):.2g} in a typical one: rounded to "
+            "another precision? store both alike, or leave next_observations out"
+        )
 
 
 def _jumps(observations: np.ndarray, jump: float | None) -> np.ndarray:
