@@ -11,6 +11,8 @@ episode, the cap truncates it. Environment 0 of a batch starts as the single one
 
 from __future__ import annotations
 
+import difflib
+import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -33,8 +35,11 @@ class _Backed:
 
     metadata: dict[str, Any]
 
-    def _open(self, task: str, physics: str, render_mode: str | None, frames: Mapping[str, Any]) -> None:
-        self._programs = programs(get_spec(task).full_name, physics)
+    def _open(
+        self, task: str, physics: str, render_mode: str | None, frames: Mapping[str, Any], cap: int | None = None
+    ) -> None:
+        _require_known(type(self), frames)
+        self._programs = programs(get_spec(task).full_name, physics, cap)
         self.task = self._programs.task
         self.metadata = self.metadata | {"render_fps": steps_per_second(self.task)}
         self.render_mode = render_mode
@@ -71,7 +76,7 @@ class TaskGymEnv(_Backed, gymnasium.Env):
         task: the Brax environment behind it.
 
     Raises:
-        ValueError: unknown task, engine, render mode or camera; the message names the choices.
+        ValueError: unknown task, engine, keyword, render mode or camera; the message names the choices.
         NoOpenGL: frames are wanted and this machine cannot draw.
     """
 
@@ -135,6 +140,7 @@ class TaskVectorEnv(_Backed, gymnasium.vector.VectorEnv):
     Args:
         task: a name that ``envs.make`` knows.
         num_envs: how many.
+        max_episode_steps: truncates episodes that early; None or -1: where the task does, which is the most.
         physics: the engine.
         render_mode: None or "rgb_array".
         **frames: as in ``TaskGymEnv``.
@@ -150,12 +156,18 @@ class TaskVectorEnv(_Backed, gymnasium.vector.VectorEnv):
     metadata = _METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
-        self, task: str, num_envs: int = 1, physics: str = "auto", render_mode: str | None = None, **frames: Any
+        self,
+        task: str,
+        num_envs: int = 1,
+        physics: str = "auto",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        **frames: Any,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         self.num_envs = num_envs
-        self._open(task, physics, render_mode, frames)
+        self._open(task, physics, render_mode, frames, _earlier_cap(task, max_episode_steps))
         self.single_observation_space, self.single_action_space = self._programs.spaces
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -213,6 +225,26 @@ class TaskVectorEnv(_Backed, gymnasium.vector.VectorEnv):
         return np.ones(self.num_envs, bool)
 
 
+def _require_known(env: type, frames: Mapping[str, Any]) -> None:
+    """Raise ValueError for a keyword that neither the environment nor its renderer takes."""
+    names = inspect.signature(Renderer.__init__).parameters
+    drawn = [name for name in names if name not in ("self", "env")]
+    known = [name for name in inspect.signature(env).parameters if name != "frames"] + drawn
+    for name in frames:
+        if name not in drawn:
+            near = max(known, key=lambda other: difflib.SequenceMatcher(None, other, name).ratio())
+            raise ValueError(f"there is no keyword {name!r}; did you mean {near!r}? (keywords: {', '.join(known)})")
+
+
+def _earlier_cap(task: str, steps: int | None) -> int | None:
+    """Return ``steps`` where that is less than the task's own cap, else None."""
+    if steps is None or steps == -1:
+        return None
+    if steps < 1:
+        raise ValueError(f"max_episode_steps must be at least 1, not {steps}")
+    return steps if steps < get_spec(task).episode_length else None
+
+
 def _renderer(task: Task, render_mode: str | None, frames: Mapping[str, Any]) -> Renderer | None:
     if render_mode is None:
         return None
@@ -223,14 +255,15 @@ def _renderer(task: Task, render_mode: str | None, frames: Mapping[str, Any]) ->
 
 def register_tasks() -> None:
     """Register with Gymnasium every task that is not yet; for families that were added after the import."""
-    names = {spec.full_name for spec in list_tasks()} | {spec.name for spec in list_tasks()}
-    for name in sorted(names):
+    caps = {name: spec.episode_length for spec in list_tasks() for name in (spec.full_name, spec.name)}
+    for name in sorted(caps):
         if f"qdos/{name}-v0" not in gymnasium.registry:
             gymnasium.register(
                 f"qdos/{name}-v0",
                 entry_point=f"{__name__}:TaskGymEnv",
                 vector_entry_point=f"{__name__}:TaskVectorEnv",
                 kwargs={"task": name},
+                max_episode_steps=caps[name],
             )
 
 

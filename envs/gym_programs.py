@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
+import os
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -11,11 +13,35 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax._src import xla_bridge  # no public name tells whether jax has been used
 
 from envs.brax_base import State
 from envs.registry import make
 from envs.task import Task
 from envs.wrappers import AutoReset
+
+
+class _Process:
+    """Hold whether this process was forked from one that had used jax, whose threads a fork does not copy."""
+
+    broken = False
+
+    @classmethod
+    def note_fork(cls) -> None:
+        """Note a fork, in the child."""
+        cls.broken = cls.broken or xla_bridge.backends_are_initialized()
+
+
+os.register_at_fork(after_in_child=_Process.note_fork)
+
+
+def require_threads() -> None:
+    """Raise ValueError in a process in which compiled programs would wait forever."""
+    if _Process.broken:
+        raise ValueError(
+            "this process was forked after jax was used and cannot run the physics; for a batch use "
+            'vectorization_mode="vector_entry_point", or start processes with context="spawn"'
+        )
 
 
 class Outcome(NamedTuple):
@@ -51,12 +77,15 @@ class Programs(NamedTuple):
 
 
 @functools.cache
-def programs(full_name: str, physics: str) -> Programs:
-    """Return the programs of a task on an engine, made once."""
+def programs(full_name: str, physics: str, cap: int | None = None) -> Programs:
+    """Return the programs of a task on an engine, made once; ``cap``: control steps that end an episode earlier."""
+    require_threads()
     # Must be set before jax is first used: MuJoCo C is called back from compiled programs, and with asynchronous
     # dispatch on a CPU such a callback can wait forever on arrays that wait for it (jax issue 25861).
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     task = make(full_name, physics=physics)
+    if cap is not None:
+        task.spec = dataclasses.replace(task.spec, episode_length=cap)
     auto = AutoReset(task)
     limits = np.full(task.observation_size, np.inf, np.float32)
     spaces = (
@@ -72,6 +101,7 @@ def programs(full_name: str, physics: str) -> Programs:
     start_compiled = jax.jit(functools.partial(start_plainly, options={}), static_argnames="num_envs")
 
     def start(random: np.random.Generator, num_envs: int, options: Mapping[str, Any] | None) -> State:
+        require_threads()
         key = jax.random.key(int(random.integers(2**32)))
         if not options:
             return start_compiled(key, num_envs)
@@ -114,8 +144,9 @@ def started(state: State | None) -> State:
     """Return the state.
 
     Raises:
-        ValueError: there is none yet.
+        ValueError: there is none yet, or this process cannot run the physics.
     """
+    require_threads()
     if state is None:
         raise ValueError("the environment has no state yet; call reset() first")
     return state

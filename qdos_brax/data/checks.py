@@ -10,7 +10,7 @@ import numpy as np
 
 from envs.task import Task, count_rows
 from qdos_brax.data.dataset import episode_bounds
-from qdos_brax.data.labelling import task_labels
+from qdos_brax.data.labelling import drop_unknown, task_labels
 from qdos_brax.data.readers.rows import SAME, Rows
 
 _ACTION_SLACK = 1e-3  # rounding of files stored in half precision; more than that is another action space
@@ -51,7 +51,11 @@ def inspect(rows: Rows, env: Task, horizon: int, attributes: Mapping[str, Any]) 
         horizon: steps of a segment.
         attributes: the file's; ``env`` names the task that its rewards were made for.
     """
-    found = Findings(errors(rows, env), list(rows.notes))
+    lines = errors(rows, env)
+    if not lines:
+        drop_unknown(rows, env)
+        lines = errors(rows, env)
+    found = Findings(lines, list(rows.notes))
     if rows.size == 0:
         return found
     horizon_errors, horizon_notes = horizon_lines(rows.ends, horizon)

@@ -17,6 +17,7 @@ def label(rows: Rows, env: Task, source: str) -> Dataset:
         env: the task; its ``labels`` of the states before the action decide, as online.
         source: where the rows came from, for messages.
     """
+    drop_unknown(rows, env)
     rewards, masks = task_labels(rows, env)
     return Dataset(
         observations=rows.observations,
@@ -30,6 +31,21 @@ def label(rows: Rows, env: Task, source: str) -> Dataset:
         extra=rows.extra,
         quality=rows.quality,
         source=source,
+    )
+
+
+def drop_unknown(rows: Rows, env: Task) -> None:
+    """Drop rows without a next observation in which the task goes on, in place: values would use an invented one."""
+    if rows.unknown_next is None or not rows.unknown_next.any():
+        return
+    unknown, (_, masks) = rows.unknown_next, task_labels(rows, env)
+    dropped = unknown & (masks > 0)
+    rows.drop(dropped)
+    rows.unknown_next = None
+    gone = int(dropped.sum())
+    rows.notes.append(
+        f"no next_observations: of {unknown.sum()} terminal rows that end an episode, {unknown.sum() - gone} are kept "
+        f"and {gone} dropped, where {env.spec.name} goes on"
     )
 
 

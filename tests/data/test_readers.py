@@ -289,3 +289,40 @@ def test_next_observations_show_where_episodes_end(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.flatnonzero(rows.ends), [8, 15, 23])
     np.testing.assert_array_equal(rows.next_observations, following)
     assert rows.size == 24
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("following", [True, False])
+def test_files_with_hardly_any_rows_are_read(tmp_path: Path, count: int, following: bool) -> None:
+    columns = {"observations": np.zeros((count, 29)), "actions": np.zeros((count, 8)), "terminals": np.zeros(count)}
+    if following:
+        columns["next_observations"] = np.zeros((count, 29))
+    rows = formats.load(write_d4rl(tmp_path / "few.hdf5", columns))
+    assert rows.size == (count if following else 0)
+
+
+@pytest.mark.parametrize("states", [False, True])
+def test_d4rl_terminal_last_rows_are_kept_where_the_task_ends(tmp_path: Path, states: bool) -> None:
+    """The file marks each episode's end; with states the task decides, and here no state is at its goal."""
+    columns = d4rl_antmaze()
+    columns["terminals"] = columns.pop("timeouts")
+    columns["rewards"][columns["terminals"]] = 1.0
+    if not states:
+        del columns["infos/qpos"], columns["infos/qvel"]
+    env = envs.make("antmaze-medium")
+    rows = formats.load(write_d4rl(tmp_path / "a.hdf5", columns), env.jump)
+    np.testing.assert_array_equal(np.flatnonzero(rows.terminals), [8, 15, 23])
+    labelled = label(rows, env, "a")
+    kept = KEPT if states else np.arange(24)
+    np.testing.assert_array_equal(labelled.observations, columns["observations"][kept])
+    np.testing.assert_array_equal(np.flatnonzero(labelled.ends), [7, 13, 20] if states else [8, 15, 23])
+    np.testing.assert_array_equal(labelled.masks == 0, np.zeros(21, bool) if states else columns["terminals"])
+    assert f"{0 if states else 3} are kept and {3 if states else 0} dropped" in rows.notes[-1]
+
+
+def test_rounded_next_observations_are_named(tmp_path: Path) -> None:
+    columns = d4rl_antmaze()
+    following = np.concatenate([columns["infos/qpos"], columns["infos/qvel"]], axis=1)
+    columns["next_observations"] = following.astype(np.float16)
+    with pytest.raises(UserError, match=r"next_observations do not match .*by up to \S+ in a typical one"):
+        formats.load(write_d4rl(tmp_path / "a.hdf5", columns))

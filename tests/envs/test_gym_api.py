@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -272,3 +274,49 @@ def test_options_go_to_the_tasks_reset(sliding: Any, monkeypatch: pytest.MonkeyP
     batch, single = gym_api.TaskVectorEnv("antmaze", num_envs=2), gym_api.TaskGymEnv("antmaze")
     np.testing.assert_array_equal(batch.reset(options={"start_xy": (2.0, 3.0)})[0], [[2, 3, 0, 0]] * 2)
     np.testing.assert_array_equal(single.reset(options={"start_xy": (2.0, 3.0)})[0], [2, 3, 0, 0])
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+@pytest.mark.parametrize(("wrong", "near"), [("phyics", "physics"), ("rendermode", "render_mode"), ("hight", "height")])
+def test_unknown_keywords_are_refused_with_the_nearest(make: Any, wrong: str, near: str) -> None:
+    with pytest.raises(ValueError, match=f"{wrong}.*did you mean '{near}'"):
+        make(MEDIUM, **{wrong: "mjx"})
+
+
+@pytest.mark.parametrize("steps", [0, -2])
+def test_a_batch_refuses_a_limit_without_steps(steps: int) -> None:
+    with pytest.raises(ValueError, match="max_episode_steps must be at least 1"):
+        gymnasium.make_vec(MEDIUM, physics="mujoco", max_episode_steps=steps)
+
+
+def test_specs_name_the_cap_and_a_shorter_limit_truncates() -> None:
+    for spec in envs.list_tasks():
+        assert gymnasium.spec(f"qdos/{spec.full_name}-v0").max_episode_steps == spec.episode_length
+    single = gymnasium.make(MEDIUM, physics="mujoco", max_episode_steps=5)
+    batch = gymnasium.make_vec(MEDIUM, num_envs=2, physics="mujoco", max_episode_steps=5)
+    single.reset(seed=0), batch.reset(seed=0)
+    for step in range(1, 6):
+        assert single.step(np.zeros(8, np.float32))[3] == (step == 5)
+        assert batch.step(np.zeros((2, 8), np.float32))[3].tolist() == [step == 5] * 2
+
+
+def _async_reset(options: str) -> subprocess.CompletedProcess[str]:
+    program = (
+        "import gymnasium, envs.gym_api\n"
+        "if __name__ == '__main__':\n"
+        f"    options = dict(num_envs=2, vectorization_mode='async', physics='mujoco'{options})\n"
+        f"    batch = gymnasium.make_vec({MEDIUM!r}, **options)\n"
+        "    print(batch.reset(seed=0)[0].shape)\n"
+        "    batch.close()\n"
+    )
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+
+
+def test_forked_children_refuse_instead_of_waiting_forever() -> None:
+    ended = _async_reset("")
+    assert ended.returncode and 'context="spawn"' in ended.stderr and "vector_entry_point" in ended.stderr
+
+
+def test_spawned_children_work() -> None:
+    ended = _async_reset(", vector_kwargs={'context': 'spawn'}")
+    assert ended.stdout == "(2, 29)\n", ended.stderr

@@ -9,6 +9,7 @@ import numpy as np
 
 from qdos_brax.data.readers.rows import Rows, after_action, unreadable
 from qdos_brax.data.readers.table import DataTable, HDF5Table
+from qdos_brax.errors import UserError
 
 _OPTIONAL = ("next_observations", "rewards", "timeouts", "infos/qpos", "infos/qvel", "infos/extra", "infos/quality")
 
@@ -42,7 +43,7 @@ def load(path: Path, jump: float | None) -> Rows:
     Episode ends are checked, not trusted: ant mazes of version 0 have ``timeouts`` out of step, those of version 2
     mark every row at the goal as terminal although the episode goes on, the kitchen has no ``timeouts`` and marks the
     last row of every demonstration as terminal, solved or not. Without next observations the last row of an episode
-    is only a next state.
+    is only a next state, unless it is terminal.
 
     Raises:
         UserError: unreadable, incomplete, or sizes that do not fit.
@@ -57,6 +58,7 @@ def load(path: Path, jump: float | None) -> Rows:
         if "next_observations" in table:
             (following,) = table.floats("next_observations", None)
             breaks = _breaks(observations, following)
+            _require_same_precision(path, observations, following, breaks)
         else:
             breaks = _jumps(observations, jump if "infos/qpos" in table else None)
         ends = marked | breaks
@@ -64,10 +66,15 @@ def load(path: Path, jump: float | None) -> Rows:
             ends[-1] = True
             _note_breaks(notes, marked, breaks)
         if "next_observations" not in table:
-            keep, is_next = ~ends, np.roll(~ends, 1)
-            observations, following = observations[keep], observations[is_next]
-            ends = np.roll(ends, -1)[keep]
+            # A last row without a next state is of use where the task terminates in it: labelling decides.
+            last_kept = ends & terminals
+            keep = ~ends | last_kept
+            following = observations[np.where(ends, np.arange(len(ends)), np.arange(1, len(ends) + 1))[keep]]
+            unknown = last_kept[keep]
+            ends = (ends | np.roll(ends & ~last_kept, -1))[keep]
+            observations = observations[keep]
         rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes)
+        rows.unknown_next = None if keep is None else unknown
         rows.terminals = terminals.astype(np.float32) if keep is None else terminals[keep].astype(np.float32)
         for key in ("qpos", "qvel"):
             if f"infos/{key}" in table:
@@ -81,6 +88,8 @@ def load(path: Path, jump: float | None) -> Rows:
             rows.quality = quality if keep is None else quality[keep]
         if _KITCHEN.fits(table, rows):
             rows.terminals = np.asarray(rows.rewards == _KITCHEN.rewards[-1], np.float32)
+            if rows.unknown_next is not None:
+                rows.drop(rows.unknown_next)
             notes.append("no timeouts: demonstrations end at their terminals, and only four complete tasks terminate")
         after_action(path, rows)
         return rows
@@ -89,9 +98,23 @@ def load(path: Path, jump: float | None) -> Rows:
 def _breaks(observations: np.ndarray, following: np.ndarray) -> np.ndarray:
     """Return bool[N]: the next observation is not the next row's."""
     breaks = np.zeros(len(observations), bool)
-    if observations.shape == following.shape:  # else the sizes are reported by the checks
+    if len(breaks) > 1 and observations.shape == following.shape:  # else the sizes are reported by the checks
         breaks[:-1] = np.abs(observations[1:] - following[:-1]).reshape(len(breaks) - 1, -1).max(axis=1) > 1e-6
     return breaks
+
+
+def _require_same_precision(path: Path, observations: np.ndarray, following: np.ndarray, breaks: np.ndarray) -> None:
+    """Raise UserError where most next observations are nearly, not exactly, the next row's: they were rounded."""
+    if len(breaks) < 2 or breaks.mean() <= 0.5:
+        return
+    apart = np.abs(observations[1:] - following[:-1])[breaks[:-1]]
+    limit = 2.0**-10 * np.abs(observations[1:])[breaks[:-1]] + 1e-6  # float16 rounds to within half of it
+    if (apart <= limit).reshape(len(apart), -1).all(axis=1).mean() > 0.5:
+        raise UserError(
+            f"{path}: next_observations do not match the next row's observations in {breaks.sum()} of {len(breaks)} "
+            f"rows, by up to {np.median(apart.reshape(len(apart), -1).max(axis=1)):.2g} in a typical one: rounded to "
+            "another precision? store both alike, or leave next_observations out"
+        )
 
 
 def _jumps(observations: np.ndarray, jump: float | None) -> np.ndarray:

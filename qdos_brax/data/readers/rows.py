@@ -31,6 +31,7 @@ class Rows:
         qpos: [N, nq] before the action, or None.
         qvel: [N, nv] before the action, or None.
         extra: int32[N, e], discrete state before the action, or None.
+        unknown_next: bool[N], rows whose next observation is not in the file (their own is repeated), or None.
         quality: int8[N], what produced the step, or None.
         notes: what the reader had to correct or leave out, one line each.
     """
@@ -45,12 +46,19 @@ class Rows:
     qvel: np.ndarray | None = None
     extra: np.ndarray | None = None
     quality: np.ndarray | None = None
+    unknown_next: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
 
     @property
     def size(self) -> int:
         """Return the number of transitions."""
         return len(self.observations)
+
+    def drop(self, rows: np.ndarray) -> None:
+        """Drop the rows of a mask bool[N], in place; an episode that loses its last row ends one row earlier."""
+        self.ends[:-1] |= self.ends[1:] & rows[1:]
+        for name, value in self.arrays().items():
+            setattr(self, name, np.ascontiguousarray(value[~rows]))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays that are there, by name."""
@@ -95,7 +103,8 @@ def after_action(path: Path, rows: Rows) -> None:
         return
     if min(qpos.shape[1], observations.shape[1]) < 2 or _agree(qpos, observations).mean() > 0.5:
         return
-    if _agree(qpos, rows.next_observations).mean() < 0.99:
+    known = np.ones(rows.size, bool) if rows.unknown_next is None else ~rows.unknown_next
+    if not known.any() or _agree(qpos, rows.next_observations)[known].mean() < 0.99:
         return
     nq = qpos.shape[1]
     if qvel is None or qvel.ndim != 2 or observations.shape[1] != nq + qvel.shape[1]:
