@@ -18,7 +18,8 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 from envs import gym_api, gym_programs, render
-from qdos_brax.commands import cli
+from qdos_brax.commands.main import main
+from qdos_brax.commands.train import train_main
 from qdos_brax.data import checks, formats
 from qdos_brax.data.device import to_device
 from qdos_brax.errors import UserError
@@ -191,16 +192,16 @@ def test_rollouts_of_skills_start_from_the_whole_state(env: reacher.Reacher, fil
 
 
 def test_data_check_and_info(file: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert cli.main(["data", "check", str(file), "--env", "reacher", "--horizon", "5"]) == 0
+    assert main(["data", "check", str(file), "--env", "reacher", "--horizon", "5"]) == 0
     assert "fits reacher-task1: 2,400 transitions, 60 episodes" in capsys.readouterr().out
-    assert cli.main(["data", "info", str(file)]) == 0
+    assert main(["data", "info", str(file)]) == 0
     assert "extra              int32 2400x1" in capsys.readouterr().out
     for arguments, message in (
         (["check", str(file), "--env", "antmaze-medium"], "made for another task?"),
         (["check", str(file), "--env", "reacher", "--map", str(tmp_path / "map.png")], "has a position on a map"),
         (["make", "reacher", "--out", str(tmp_path / "a.hdf5")], "no expert is shipped for reacher"),
     ):
-        assert cli.main(["data", *arguments]) == 2
+        assert main(["data", *arguments]) == 2
         output = capsys.readouterr()
         assert message in output.out + output.err
 
@@ -211,7 +212,7 @@ def test_training_knows_no_maze(file: Path, tmp_path: Path, capsys: pytest.Captu
     sets = ["skills.horizon=5", "values.n_step=5", "high_level.env_steps=400", "high_level.warmup_env_steps=80"]
     sets += ["labels.start_env_steps=80", "eval.episodes=2", "eval.every_env_steps=200"]
     arguments = ["--env", "reacher", "--preset", "smoke", "--dataset", str(file), "--out", str(out)]
-    assert cli.train_main([*arguments, *(part for text in sets for part in ("--set", text))]) == 0
+    assert train_main([*arguments, *(part for text in sets for part in ("--set", text))]) == 0
     output = capsys.readouterr()
     assert "left out" not in output.err
     summary = json.loads((out / "summary.json").read_text())

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from qdos_brax.commands import cli
+from qdos_brax.commands.main import main
 from qdos_brax.config import Config, default_preset
 from qdos_brax.config.schema import groups, leaves
 
 
 def shown(command: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    assert cli.main(["config", *shlex.split(command)]) == 0
+    assert main(["config", *shlex.split(command)]) == 0
     return capsys.readouterr().out.splitlines()
 
 
@@ -86,7 +86,7 @@ def test_a_group_shows_its_own_keys_alone(capsys: pytest.CaptureFixture[str]) ->
     ],
 )
 def test_wrong_requests_are_one_line(command: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["config", *shlex.split(command)]) == 2
+    assert main(["config", *shlex.split(command)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: ") and message in lines[0]
 
@@ -94,7 +94,7 @@ def test_wrong_requests_are_one_line(command: str, message: str, capsys: pytest.
 def test_a_named_preset_needs_no_jax() -> None:
     """The answer is there at once: no device is started, nor jax loaded."""
     code = (
-        "import sys; from qdos_brax.commands.cli import main; code = main(['config', '--preset', 'cpu']); "
+        "import sys; from qdos_brax.commands.main import main; code = main(['config', '--preset', 'cpu']); "
         "sys.exit(code or 'jax' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2], stdout=subprocess.DEVNULL)

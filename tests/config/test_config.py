@@ -14,16 +14,6 @@ from qdos_brax.config import Config, load_config, schema
 from qdos_brax.errors import UserError
 
 
-@pytest.fixture(autouse=True)
-def every_family_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have tasks for the YAMLs whose families are not written yet."""
-    for name, variant in (("cube", "single"), ("kitchen", "mixed"), ("scene", "")):
-        if name not in envs.FAMILIES:
-            variants = {variant: envs.Variant(1, 1, 1)}
-            monkeypatch.setitem(envs.FAMILIES, name, envs.Family("none:none", ("mujoco",), variants, variant))
-            monkeypatch.setitem(envs.ALIASES, name, f"{name}-{variant}" if variant else name)
-
-
 @pytest.mark.parametrize("preset", configs.presets())
 @pytest.mark.parametrize("family", configs.families())
 def test_every_family_loads_with_every_preset(family: str, preset: str, tmp_path: Path) -> None:
