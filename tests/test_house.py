@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+pytestmark = pytest.mark.quick
 
 ROOT = Path(__file__).parents[1]
 # From the ground up; what stands on one floor does not import one another.
@@ -32,6 +35,15 @@ LEARNERS = {"nn", "skills", "labels", "high_level", "offline", "collection", "me
 # The errors of all floors, and how files are written; neither knows of anything else.
 EVERYWHERE = {"errors", "files"}
 TOP_FILES, FILE_LINES = 6, 330
+# What public docstrings begin with; a verb that is missing here may be added.
+VERBS = frozenset(re.findall(r"\w+", """
+    Act Add Analyse Apply Ask Average Call Change Check Clone Close Collect Combine Compile Compute Configure
+    Connect Continue Create Decide Decode Define Describe Do Draw Drop Encode End Evaluate Exchange Film Find
+    Finish Format Give Hold Identify Infer Join Keep Label Learn List Load Lock Log Look Make Map Measure Move
+    Name Normalise Open Parse Place Play Predict Print Put Raise Read Receive Refuse Register Regress Remove
+    Replace Report Return Reward Rotate Run Save Schedule Send Set Show Simulate Stack Start Step Take Train Turn
+    Update Verify Wait Walk Weight Write Yield
+"""))  # fmt: skip
 FUNCTION_LINES_MEDIAN, FUNCTION_LINES_P95 = 6, 24
 
 
@@ -107,3 +119,23 @@ def test_functions_stay_short() -> None:
     ]
     assert np.median(lengths) <= FUNCTION_LINES_MEDIAN
     assert np.percentile(lengths, 95) <= FUNCTION_LINES_P95
+
+
+def public_docstrings(node: ast.AST) -> Iterator[tuple[str, str]]:
+    """Yield (name, docstring) of every public function, method and class below ``node`` that has one."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.FunctionDef | ast.ClassDef) and not child.name.startswith("_"):
+            if text := ast.get_docstring(child):
+                yield child.name, text
+            if isinstance(child, ast.ClassDef):
+                yield from public_docstrings(child)
+
+
+def test_public_docstrings_begin_with_a_verb() -> None:
+    others = [
+        f"{path.relative_to(ROOT)}: {name}: {text.splitlines()[0]}"
+        for path in sources("qdos_brax", "envs")
+        for name, text in public_docstrings(ast.parse(path.read_text(encoding="utf-8")))
+        if re.split(r"[\s.,:;]", text, maxsplit=1)[0] not in VERBS
+    ]
+    assert not others

@@ -27,7 +27,7 @@ from qdos_brax.runs.folder import RunFolder
 
 
 class TrainedRun(NamedTuple):
-    """What a finished run has learned.
+    """Hold what a finished run has learned.
 
     Attributes:
         config: the run's configuration.
@@ -96,12 +96,12 @@ def _policy(config: Config, env: Any) -> Callable[[Any, Any], Policy]:
 
 
 def evaluation_key() -> jax.Array:
-    """For starts that no training or evaluation of a run has seen: a key of its own, the same for every member."""
+    """Return the key for starts that no training or evaluation of a run has seen, the same for every member."""
     return jax.random.key(2**32 - 1)
 
 
 def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
-    """Plays whole episodes with the agents of a finished run.
+    """Play whole episodes with the agents of a finished run.
 
     Args:
         run: the run folder.

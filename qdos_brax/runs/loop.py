@@ -28,7 +28,7 @@ _WALL_PARTS = ("data", "pretrain", "label", "online", "eval")
 
 
 class Phase(Protocol):
-    """One part of a run, cut into chunks: jitted programs of many steps each.
+    """Define one part of a run, cut into chunks: jitted programs of many steps each.
 
     Attributes:
         name: the column ``phase`` of metrics.csv.
@@ -63,7 +63,7 @@ class Phase(Protocol):
         ...
 
     def finish(self, state: Any, artifacts: Artifacts) -> Artifacts:
-        """Everything that the next phases need: nested dicts with text keys and arrays at the leaves."""
+        """Return everything that the next phases need: nested dicts with text keys and arrays at the leaves."""
         ...
 
 

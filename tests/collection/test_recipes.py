@@ -10,6 +10,8 @@ from qdos_brax.collection.profiles import ANT
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.errors import UserError
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_the_share_of_degraded_episodes_is_as_stated(share: float) -> None:

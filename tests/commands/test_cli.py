@@ -14,6 +14,8 @@ from qdos_brax.commands.main import main
 from qdos_brax.commands.train import configs_from_args, train_main, train_parser
 from tests.runs import toy
 
+pytestmark = pytest.mark.quick
+
 
 def run(command: str, train: bool = True) -> int:
     try:

@@ -13,6 +13,8 @@ from qdos_brax.commands.main import main
 from qdos_brax.config import Config, default_preset
 from qdos_brax.config.schema import groups, leaves
 
+pytestmark = pytest.mark.quick
+
 
 def shown(command: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
     assert main(["config", *shlex.split(command)]) == 0

@@ -13,6 +13,8 @@ from qdos_brax import config as configs
 from qdos_brax.config import Config, load_config, schema
 from qdos_brax.errors import UserError
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.mark.parametrize("preset", configs.presets())
 @pytest.mark.parametrize("family", configs.families())

@@ -13,6 +13,8 @@ from qdos_brax.data import checks, formats
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
 
+pytestmark = pytest.mark.quick
+
 TASK = "antmaze-medium-task1"
 
 

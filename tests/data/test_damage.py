@@ -17,6 +17,8 @@ from qdos_brax.data.labelling import label
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
 
+pytestmark = pytest.mark.quick
+
 FILES = Path(__file__).parent / "files"
 FORMATS = ("npz", "npz-plain", "ours", "d4rl", "minari-flat", "minari-dict")
 GUARDED = ("npz", "npz-plain", "ours")  # by checksums over everything that is read; D4RL's and Minari's are not

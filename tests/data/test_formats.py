@@ -14,6 +14,8 @@ import envs
 from qdos_brax.data import formats
 from qdos_brax.errors import UserError
 
+pytestmark = pytest.mark.quick
+
 TASK = "antmaze-medium-task1"
 
 

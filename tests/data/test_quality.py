@@ -8,6 +8,8 @@ import pytest
 from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.mark.parametrize("seed", range(5))
 def test_auc_equals_the_count_over_all_pairs(seed: int) -> None:

@@ -19,6 +19,8 @@ from qdos_brax.data.labelling import label
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
 
+pytestmark = pytest.mark.quick
+
 FILES = Path(__file__).parent / "files"
 OGBENCH = FILES / "ogbench-antmaze-medium.npz"  # two trajectories of twelve rows
 SHARED = ("observations", "actions", "next_observations", "qpos", "qvel")

@@ -8,6 +8,8 @@ import pytest
 from qdos_brax.data.dataset import episode_bounds
 from qdos_brax.data.segments import episode_last, macro_return, segment_starts, window
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.mark.parametrize("seed", range(20))
 def test_windows_are_exactly_those_inside_one_episode(seed: int) -> None:

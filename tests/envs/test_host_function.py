@@ -17,6 +17,8 @@ import pytest
 from envs.physics import host_function, xla_ffi
 from envs.physics.host_function import HostFunction
 
+pytestmark = pytest.mark.quick
+
 ROOT = Path(__file__).parents[2]
 STRUCTS = (
     xla_ffi.XLA_FFI_Extension_Base,

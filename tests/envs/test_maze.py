@@ -10,6 +10,8 @@ import pytest
 from envs.mazes.maze import Maze, get_maze
 from tests.envs.ogbench_reference import ogbench_env
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.mark.parametrize("name", ["medium", "giant", "teleport"])
 def test_next_step_table_equals_ogbench(name: str) -> None:

@@ -10,6 +10,8 @@ from qdos_brax.high_level.evaluation import evaluate
 from qdos_brax.high_level.macro_step import macro_step, reset_done
 from qdos_brax.skills.latent_map import Prior, latent_map
 
+pytestmark = pytest.mark.quick
+
 
 class Line(Env):
     """x grows by the action; success (read before the action) at x >= goal; a cap on steps. obs = [x]."""

@@ -74,6 +74,7 @@ def test_it_finds_both_solutions_and_no_failure():
     data = device_data(states, actions, rewards=np.where(kind < 2, 0.0, -5.0), masks=np.zeros(2000))
     learner = DiveOff(1, 2, 1, DiveOffConfig(hidden=(32, 32), batch_size=128, autoencoder_updates=300))
     hyper = {
+        "skills.latent_box": 2.0,
         "diveoff.learning_rate": 3e-3,
         "diveoff.autoencoder_rate": 0.1,
         "diveoff.discount": 0.99,

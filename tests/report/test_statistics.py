@@ -10,6 +10,8 @@ import pytest
 
 from qdos_brax.report.statistics import interquartile_mean, mean_curve, mean_std, probability_of_improvement
 
+pytestmark = pytest.mark.quick
+
 
 def test_standard_deviation_is_the_papers() -> None:
     """Table 2 of the paper: 13,334 ± 5,774 and 5,834 ± 1,443 are three seeds at its evaluation steps, with n - 1."""

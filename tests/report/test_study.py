@@ -19,6 +19,8 @@ from qdos_brax.report.write import write_report
 from qdos_brax.runs import comparison
 from tests.report.folders import write_run
 
+pytestmark = pytest.mark.quick
+
 
 def labels(*paths: Path) -> dict[str, int]:
     return {s.label: sum(map(len, s.members.values())) for s in read_study(paths).settings}

@@ -15,6 +15,8 @@ import pytest
 from qdos_brax.errors import UserError
 from qdos_brax.runs.checkpoint import BrokenCheckpoint, CheckpointStore, Position
 
+pytestmark = pytest.mark.quick
+
 HERE = Position(0, 1, 4, ("member", "sps"), {"total": 1.0})
 
 

@@ -14,6 +14,8 @@ from qdos_brax.files import is_partial, replacing_folder, write_text
 from qdos_brax.runs import signals
 from qdos_brax.runs.folder import RunFolder, new_path
 
+pytestmark = pytest.mark.quick
+
 
 def made(path: Path) -> RunFolder:
     folder = RunFolder.create(path)

@@ -11,6 +11,8 @@ import pytest
 from qdos_brax.errors import UserError
 from qdos_brax.runs.metrics import MetricsTable, read_rows
 
+pytestmark = pytest.mark.quick
+
 MEMBERS = [{"seed": 0, "alpha": 0.1}, {"seed": 1, "alpha": 0.1}]
 
 
