@@ -15,7 +15,7 @@ import numpy as np
 
 from envs.physics import xla_ffi
 
-_registered: dict[str, Callable[..., tuple[np.ndarray, ...]]] = {}
+_registered: set[str] = set()
 
 
 class HostFunction:
@@ -39,7 +39,7 @@ class HostFunction:
             return tuple(jax.pure_callback(self._function, tuple(results), *args, vmap_method="broadcast_all"))
         if self.target not in _registered:
             xla_ffi.register(self.target, self._function)
-            _registered[self.target] = self._function
+            _registered.add(self.target)
         return tuple(jax.ffi.ffi_call(self.target, tuple(results), vmap_method="broadcast_all")(*args))
 
 
