@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.body_frame import BodyFrame
 from envs.brax_base import Env, State
 from envs.families import TaskSpec
 from envs.physics.base import Engine, PipelineState
@@ -73,8 +74,8 @@ class Task(Env, ABC):
     Success is read on the state before the action (OGBench's ``success_timing="pre"``), success ends the episode, and
     ``step`` never resets: see ``envs.AutoReset``.
 
-    What not every task can do has a method all the same, which returns None where the task cannot: ``position``,
-    ``floor_map``, ``distance_left``. Maps, paths, reports and checks leave out what is None.
+    What not every task can do has a member all the same, which is None where the task cannot: ``position``,
+    ``floor_map``, ``distance_left``, ``body_frame``. Maps, paths, reports and checks leave out what is None.
 
     Args:
         spec: which task.
@@ -85,10 +86,12 @@ class Task(Env, ABC):
         distance_margin: change of ``distance_left`` that counts as progress or as a setback.
         jump: distance that the first two numbers of an observation, a position then, never move in one control step;
             None where they are no position. Readers of data files find unmarked ends of episodes by it.
+        body_frame: which numbers of an observation move and turn with the body.
     """
 
     distance_margin = 0.0
     jump: float | None = None
+    body_frame: BodyFrame | None = None
 
     def __init__(self, spec: TaskSpec, engine: Engine, goal: Any = ()) -> None:
         self.spec = spec

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from envs.body_frame import BodyFrame
 from envs.families import TaskSpec
 from envs.mazes.bodies import ANT, HUMANOID, Body
 from envs.mazes.families import cells_of
@@ -61,6 +62,7 @@ class AntMaze(BodyTask):
     """Simulate an ant in a maze: qpos 15, qvel 14, action 8, observation 29, 10 control steps per second."""
 
     body = ANT
+    body_frame = BodyFrame(heading=3, vectors=(15,))
 
 
 class HumanoidMaze(BodyTask):
@@ -74,6 +76,8 @@ class HumanoidMaze(BodyTask):
     """
 
     body = HUMANOID
+    # Its heading is not observed, so that nothing can be turned.
+    body_frame = BodyFrame()
 
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         super().__init__(spec, physics)

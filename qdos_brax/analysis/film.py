@@ -59,20 +59,20 @@ class EpisodeRunner:
         self._step = jax.jit(self._step_once)
 
     def episode(self, member: int) -> Iterator[tuple[Any, jax.Array | None]]:
-        """Yield the states of a member's first episode, each with the latent that led to it (None for the start)."""
+        """Yield the states of a member's first episode, each with the decision that led to it (None for the start)."""
         learned = of_member(self._trained, member)
         state = self._reset(jax.random.split(evaluation_key(), 1)[0])
         yield state, None
         length = 0
         while not state.done:
             if length % self._trained.config.skills.horizon == 0:
-                latent = self._choose(*learned, state.obs)
-            state = self._step(*learned, state, latent)
+                decision = self._choose(*learned, state.obs)
+            state = self._step(*learned, state, decision)
             length += 1
-            yield state, latent
+            yield state, decision
 
-    def _step_once(self, artifacts: Any, hyper: Any, state: Any, latent: jax.Array) -> Any:
-        return self._trained.env.step(state, self._trained.agent(artifacts, hyper).play(state.obs, latent))
+    def _step_once(self, artifacts: Any, hyper: Any, state: Any, decision: jax.Array) -> Any:
+        return self._trained.env.step(state, self._trained.agent(artifacts, hyper).play(state.obs, decision))
 
 
 def of_member(trained: TrainedRun, member: int) -> tuple[Any, Any]:

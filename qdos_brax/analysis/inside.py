@@ -177,15 +177,18 @@ class _LatentView:
         return found | {"grid": paths[: len(grid)], "between": paths[len(grid) :]}
 
     def _path(self, artifacts: Any, hyper: Any, latent: jax.Array) -> jax.Array:
-        """Return float[T + 1, 2], the positions from the start on while one latent is kept."""
+        """Return float[T + 1, 2], the positions from the start on while one latent is begun again and again."""
         env, agent = self._trained.env, self._trained.agent(artifacts, hyper)
+        horizon = self._trained.config.skills.horizon
 
-        def step(state: Any, _: None) -> tuple[Any, jax.Array]:
-            state = env.step(state, agent.play(state.obs, latent))
-            return state, _place_of_body(env, state.pipeline_state.qpos)
+        def step(carry: tuple[Any, jax.Array], t: jax.Array) -> tuple[Any, jax.Array]:
+            state, skill = carry
+            skill = jnp.where(t % horizon == 0, agent.begin(state.obs, latent), skill)
+            state = env.step(state, agent.play(state.obs, skill))
+            return (state, skill), _place_of_body(env, state.pipeline_state.qpos)
 
         start = env.reset(evaluation_key())
-        _, path = jax.lax.scan(step, start, None, self._steps)
+        _, path = jax.lax.scan(step, (start, agent.begin(start.obs, latent)), jnp.arange(self._steps))
         return jnp.concatenate([_place_of_body(env, start.pipeline_state.qpos)[None], path])
 
 
@@ -230,9 +233,10 @@ def _between(latents: np.ndarray) -> np.ndarray:
 def _episode(trained: TrainedRun, runner: EpisodeRunner, member: int) -> Arrays:
     states: list[tuple[np.ndarray, ...]] = []
     latents: list[np.ndarray] = []
-    for state, latent in runner.episode(member):
-        if latent is not None and (len(states) - 1) % trained.config.skills.horizon == 0:
-            latents.append(np.asarray(latent))
+    width = make_low_level(trained.config, trained.env).width  # a skill's first numbers are its latent
+    for state, decision in runner.episode(member):
+        if decision is not None and (len(states) - 1) % trained.config.skills.horizon == 0:
+            latents.append(np.asarray(decision)[:width])
         physics = state.pipeline_state
         states.append(tuple(map(np.asarray, (physics.qpos, state.info["goal"], physics.extra))))
     qpos, _, extra = map(np.stack, zip(*states, strict=True))

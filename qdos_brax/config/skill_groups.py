@@ -67,6 +67,14 @@ class SkillsConfig:
 
     horizon: int = count(20, "environment steps H of a segment and of a macro step; 1 for methods without skills")
     latent_dim: int = count(8, "size of the skill z")
+    view: str = choice(
+        "world",
+        "frame in which skills see the body: world (the observation as it is), start (from where it stood and faced "
+        "when the skill began) or body (from where it stands and faces now)",
+        "world",
+        "start",
+        "body",
+    )
     encoder_hidden: int = count(256, "width of the bidirectional GRU (the posterior)")
     encoder_layers: int = count(2, "layers of the bidirectional GRU")
     decoder_hidden: tuple[int, ...] = widths((256, 256), "hidden layers of the low-level policy")

@@ -95,13 +95,13 @@ class Acting:
             guided = self._guide.sample(guide_params, _guide_key(actor_key), observation)
             guided = agent.low_level.to_action(agent.skills, guided, observation, agent.box)
             action = jnp.where(state.guided[:, None] > 0, guided, action)
-        latent = agent.low_level.to_latent(agent.skills, action, observation, agent.box)
+        skill = agent.skill(action, observation)
         discount = hyper["high_level.discount"]
 
-        def one(env_state: State, latent: jax.Array) -> tuple[State, MacroStep]:
-            return macro_step(self._env, lambda obs: agent.play(obs, latent), env_state, self._horizon, discount)
+        def one(env_state: State, skill: jax.Array) -> tuple[State, MacroStep]:
+            return macro_step(self._env, lambda obs: agent.play(obs, skill), env_state, self._horizon, discount)
 
-        env_state, result = jax.vmap(one)(state.env_state, latent)
+        env_state, result = jax.vmap(one)(state.env_state, skill)
         rows = Transition(observation, action, result.reward, result.mask, self._normalise(result.next_observation))
         over = (env_state.done > 0.5) | ~result.finite
         state = self._after(state, env_state, result, rows, over, reset_key)

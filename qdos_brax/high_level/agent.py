@@ -19,7 +19,7 @@ class Policy(Protocol):
         """Return the decision at observation[obs], as the environment gives it."""
         ...
 
-    def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
+    def play(self, observation: jax.Array, decision: jax.Array) -> jax.Array:
         """Return the action[act] of a decision at an observation."""
         ...
 
@@ -45,10 +45,22 @@ class Agent:
     actor: Any
 
     def choose(self, observation: jax.Array) -> jax.Array:
-        """Return the latent z[..., width] for observation[..., obs]: the mode of the high level's policy."""
-        normal = self.normaliser(observation)
-        return self.low_level.to_latent(self.skills, self.sac.mode(self.actor, normal), normal, self.box)
+        """Return the skill[..., s] to play from observation[..., obs] on, by the mode of the high level's policy.
 
-    def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """Return the action[..., act] of latent z at an observation."""
-        return self.low_level.act(self.skills, self.normaliser(observation), latent)
+        Its first ``low_level.width`` numbers are the latent z.
+        """
+        normal = self.normaliser(observation)
+        return self.skill(self.sac.mode(self.actor, normal), normal)
+
+    def skill(self, action: jax.Array, normal: jax.Array) -> jax.Array:
+        """Return the skill[..., s] that u[..., width] plays from normal[..., obs] on, a normalised observation."""
+        latent = self.low_level.to_latent(self.skills, action, normal, self.box)
+        return self.low_level.begin(self.skills, latent, normal)
+
+    def begin(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
+        """Return the skill[..., s] of z[..., width] that is played from observation[..., obs] on."""
+        return self.low_level.begin(self.skills, latent, self.normaliser(observation))
+
+    def play(self, observation: jax.Array, decision: jax.Array) -> jax.Array:
+        """Return the action[..., act] of a skill at an observation."""
+        return self.low_level.act(self.skills, self.normaliser(observation), decision)

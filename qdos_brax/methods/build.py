@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
+from envs.body_frame import BodyFrame
 from qdos_brax import config as configs
 from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS, Method
@@ -49,13 +50,15 @@ from qdos_brax.skills.skill_phase import Information, SkillPhase
 from qdos_brax.skills.vae import SkillModel
 from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
+from qdos_brax.skills.views import fit_view, make_view
 
 
 class SpaceSizes(Protocol):
-    """Give the sizes of a task's observations and actions; every environment does."""
+    """Give the sizes of a task's observations and actions, and how they turn; every environment does."""
 
     observation_size: int
     action_size: int
+    body_frame: BodyFrame | None
 
 
 class BuildContext(NamedTuple):
@@ -156,7 +159,8 @@ class _LowLevelKind(NamedTuple):
 
 def make_skill_model(config: Config, env: SpaceSizes) -> SkillModel:
     """Return the trajectory VAE of a configuration."""
-    return SkillModel(env.observation_size, env.action_size, config.skills)
+    view = make_view(config.skills.view, env.body_frame)
+    return SkillModel(env.observation_size, env.action_size, config.skills, view)
 
 
 def _trajectory_skills(config: Config, env: SpaceSizes) -> LowLevelPolicy:
@@ -170,7 +174,8 @@ def _trajectory_phases(context: BuildContext) -> list[MemberPhase]:
             f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({config.skills.horizon})"
         )
     model = make_skill_model(config, context.env)
-    skills = SkillPhase(config, model, _weights(config, method, context.env), _information(context, model))
+    view = fit_view(model.view, context.data, context.normaliser, config.skills.horizon)
+    skills = SkillPhase(config, model, _weights(config, method, context.env), _information(context, model), view)
     return [value_phase(config, context.env, context.dataset.ends), skills] if method.weighted else [skills]
 
 

@@ -43,12 +43,14 @@ class PhysicsRollout:
     def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
         """Return normalised observations[B, H, obs] before each action of the rollouts."""
 
-        def one(qpos: jax.Array, qvel: jax.Array, extra: Any, key: jax.Array, skill: jax.Array) -> jax.Array:
+        def one(qpos: jax.Array, qvel: jax.Array, extra: Any, key: jax.Array, latent: jax.Array) -> jax.Array:
+            start = self._env.reset_to(qpos, qvel, key=key, extra=extra)
+            skill = self._model.begin(params, latent, self._normalise(start.obs))
+
             def step(state: State, _: None) -> tuple[State, jax.Array]:
                 observation = self._normalise(state.obs)
                 return self._env.step(state, self._model.act(params, observation, skill)), observation
 
-            start = self._env.reset_to(qpos, qvel, key=key, extra=extra)
             return jax.lax.scan(step, start, None, length=self._horizon)[1]
 
         assert data.qpos is not None and data.qvel is not None  # refused in __init__

@@ -56,8 +56,12 @@ class LowLevelPolicy(Protocol):
         """Log density[...] at u of what the actor may be held near: the skill prior, or uniform where there is none."""
         ...
 
-    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """Return the action[..., act] of z, in [-1, 1]."""
+    def begin(self, params: Any, latent: jax.Array, observation: jax.Array) -> jax.Array:
+        """Return skill[..., s]: z, then whatever must be remembered of observation[..., obs], where it begins."""
+        ...
+
+    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
+        """Return the action[..., act] of a skill that has begun, in [-1, 1]."""
         ...
 
 
@@ -70,12 +74,20 @@ class LatentModel(Protocol):
         """Return p(z | s): (mean[..., z], log standard deviation[..., z])."""
         ...
 
-    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
-        """Return the action[..., act] of z, in [-1, 1]."""
+    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
+        """Return the action[..., act] of a skill, in [-1, 1]."""
         ...
 
 
-class LatentSkills:
+class _AnywhereSkills:
+    """Play skills that remember nothing of where they begin."""
+
+    def begin(self, params: Any, latent: jax.Array, observation: jax.Array) -> jax.Array:
+        """Return z."""
+        return latent
+
+
+class LatentSkills(_AnywhereSkills):
     """Play the latents of a model with a state prior; subclasses add the posterior.
 
     Args:
@@ -107,9 +119,9 @@ class LatentSkills:
         latent = mapping.to_latent(action, prior)
         return gaussian_log_prob(latent, *prior) + mapping.log_jacobian(action, prior)
 
-    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
         """Return the decoder's mean action."""
-        return self._model.act(params, observation, latent)
+        return self._model.act(params, observation, skill)
 
     def _prior(self, params: Any, observation: jax.Array) -> Prior:
         return Prior(*self._model.prior(params, observation))
@@ -125,11 +137,15 @@ class TrajectorySkills(LatentSkills):
 
     def __init__(self, model: SkillModel, map_name: str) -> None:
         super().__init__(model, map_name)
-        self._encode = model.encode
+        self._skills = model
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
         """Return the encoder's posterior."""
-        return self._encode(params, segments)
+        return self._skills.encode(params, segments)
+
+    def begin(self, params: Any, latent: jax.Array, observation: jax.Array) -> jax.Array:
+        """Return z and the pose in which it begins."""
+        return self._skills.begin(params, latent, observation)
 
 
 class TransitionSkills(LatentSkills):
@@ -157,7 +173,7 @@ class TransitionSkills(LatentSkills):
         return Posterior(jnp.mean(mean, axis=1), 0.5 * jnp.log(variance))
 
 
-class DirectionSkills:
+class DirectionSkills(_AnywhereSkills):
     """Play directions of travel in a representation of states: z is a unit vector, and so is every u's (HILP).
 
     Args:
@@ -197,12 +213,12 @@ class DirectionSkills:
         """Return the log density of the uniform distribution over u."""
         return jnp.full(action.shape[:-1], -self.width * jnp.log(2.0))
 
-    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
         """Return the directional policy's action."""
-        return self._act(params, observation, latent)
+        return self._act(params, observation, skill)
 
 
-class PrimitiveActions:
+class PrimitiveActions(_AnywhereSkills):
     """Play no skills: u is the action itself, and a segment is one step (RLPD, ExPLORe).
 
     Args:
@@ -233,6 +249,6 @@ class PrimitiveActions:
         """Return the log density of the uniform distribution."""
         return jnp.full(action.shape[:-1], -self.width * jnp.log(2.0))
 
-    def act(self, params: Any, observation: jax.Array, latent: jax.Array) -> jax.Array:
+    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
         """Return z itself."""
-        return latent
+        return skill

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -71,6 +73,7 @@ class SkillPhase(MemberPhase):
         model: posterior, prior and decoder.
         weights: where segment advantages come from.
         information: where the states of the mutual-information term come from, or None to leave the term out.
+        view: what the model's view knows of the data.
         blocks_per_chunk: blocks between two looks of the host.
     """
 
@@ -80,9 +83,11 @@ class SkillPhase(MemberPhase):
         model: SkillModel,
         weights: SegmentWeights,
         information: Information | None,
+        view: Mapping[str, Any] = MappingProxyType({}),
         blocks_per_chunk: int = 10,
     ) -> None:
         self._skills: SkillsConfig = config.skills
+        self._view = view
         self._model, self._weights, self._information = model, weights, information
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
         self._blocks = min(blocks_per_chunk, total_blocks)
@@ -105,7 +110,7 @@ class SkillPhase(MemberPhase):
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> SkillPhaseState:
         """Return fresh networks."""
         model_key, weights_key, key = jax.random.split(key, 3)
-        params = self._model.init(model_key)
+        params = self._model.init(model_key, self._view)
         return SkillPhaseState(
             key=key,
             params=params,

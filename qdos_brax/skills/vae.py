@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +11,7 @@ import jax.numpy as jnp
 
 from qdos_brax.config import SkillsConfig
 from qdos_brax.nn.networks import DiagonalGaussian, SegmentEncoder, gaussian_kl, gaussian_log_prob, gaussian_sample
+from qdos_brax.skills.views import View, WorldView
 
 Params = Any
 
@@ -34,47 +37,70 @@ class SkillModel:
         observation_dim: width of observations.
         action_dim: width of actions.
         config: dimension of z and widths.
+        view: what the three networks are shown of an observation.
+
+    Attributes:
+        latent_dim: width of z.
+        view: as given.
     """
 
-    def __init__(self, observation_dim: int, action_dim: int, config: SkillsConfig) -> None:
-        self.observation_dim, self.action_dim, self.latent_dim = observation_dim, action_dim, config.latent_dim
+    def __init__(
+        self, observation_dim: int, action_dim: int, config: SkillsConfig, view: View | None = None
+    ) -> None:
+        self.latent_dim, self.view = config.latent_dim, view or WorldView()
+        self._seen_dim, self._action_dim = self.view.size(observation_dim), action_dim
         self._encoder = SegmentEncoder(config.encoder_hidden, config.encoder_layers, config.latent_dim)
         self._prior = DiagonalGaussian(config.prior_hidden, config.latent_dim)
         self._decoder = DiagonalGaussian(config.decoder_hidden, action_dim)
 
-    def init(self, key: jax.Array) -> dict[str, Params]:
-        """Return fresh parameters: {"encoder", "prior", "decoder"}."""
+    def init(self, key: jax.Array, view: Mapping[str, Params] = MappingProxyType({})) -> dict[str, Params]:
+        """Return fresh parameters: {"encoder", "prior", "decoder"}, and "view", what the view knows of the data."""
         encoder_key, prior_key, decoder_key = jax.random.split(key, 3)
-        observation, action = jnp.zeros((1, 2, self.observation_dim)), jnp.zeros((1, 2, self.action_dim))
+        seen, action = jnp.zeros((1, 2, self._seen_dim)), jnp.zeros((1, 2, self._action_dim))
         return {
-            "encoder": self._encoder.init(encoder_key, observation, action),
-            "prior": self._prior.init(prior_key, observation[:, 0]),
-            "decoder": self._decoder.init(decoder_key, jnp.zeros((1, self.observation_dim + self.latent_dim))),
+            "encoder": self._encoder.init(encoder_key, seen, action),
+            "prior": self._prior.init(prior_key, seen[:, 0]),
+            "decoder": self._decoder.init(decoder_key, jnp.zeros((1, self._seen_dim + self.latent_dim))),
+            "view": dict(view),
         }
 
     def encode(self, params: dict[str, Params], segments: Segments) -> Posterior:
         """Return q(z | tau)."""
-        return Posterior(*self._encoder.apply(params["encoder"], segments.observations, segments.actions))
+        pose = self._pose(params, segments.observations[:, 0])
+        seen = self._see(params, segments.observations, pose[:, None])
+        return Posterior(*self._encoder.apply(params["encoder"], seen, segments.actions))
 
     def prior(self, params: dict[str, Params], observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return p(z | s_0): (mean[..., z], log standard deviation[..., z])."""
-        return self._prior.apply(params["prior"], observation)
+        return self._prior.apply(params["prior"], self._see(params, observation, self._pose(params, observation)))
+
+    def begin(self, params: dict[str, Params], latent: jax.Array, observation: jax.Array) -> jax.Array:
+        """Return the skill[..., z + pose] of a latent that is played from an observation on."""
+        return jnp.concatenate([latent, self._pose(params, observation)], axis=-1)
 
     def decode(
-        self, params: dict[str, Params], observation: jax.Array, latent: jax.Array
+        self, params: dict[str, Params], observation: jax.Array, skill: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return pi(a | s, z): (mean[..., act], log standard deviation[..., act])."""
-        return self._decoder.apply(params["decoder"], jnp.concatenate([observation, latent], axis=-1))
+        """Return pi(a | s, z): (mean[..., act], log standard deviation[..., act]) of a skill that has begun."""
+        latent, pose = skill[..., : self.latent_dim], skill[..., self.latent_dim :]
+        seen = self._see(params, observation, pose)
+        return self._decoder.apply(params["decoder"], jnp.concatenate([seen, latent], axis=-1))
 
-    def act(self, params: dict[str, Params], observation: jax.Array, latent: jax.Array) -> jax.Array:
+    def act(self, params: dict[str, Params], observation: jax.Array, skill: jax.Array) -> jax.Array:
         """Return the low-level policy's mean action[..., act], clipped to [-1, 1]."""
-        return jnp.clip(self.decode(params, observation, latent)[0], -1.0, 1.0)
+        return jnp.clip(self.decode(params, observation, skill)[0], -1.0, 1.0)
+
+    def decode_along(
+        self, params: dict[str, Params], observations: jax.Array, latent: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return pi(a_t | s_t, z) along observations[B, H, obs] for z[B, latent] begun at the first of them."""
+        skill = self.begin(params, latent, observations[:, 0])
+        repeated = jnp.broadcast_to(skill[:, None], (*observations.shape[:2], skill.shape[-1]))
+        return self.decode(params, observations, repeated)
 
     def reconstruction(self, params: dict[str, Params], segments: Segments, latent: jax.Array) -> jax.Array:
         """Return sum_t log pi(a_t | s_t, z), [B]."""
-        horizon = segments.actions.shape[1]
-        repeated = jnp.broadcast_to(latent[:, None], (latent.shape[0], horizon, latent.shape[1]))
-        mean, log_std = self.decode(params, segments.observations, repeated)
+        mean, log_std = self.decode_along(params, segments.observations, latent)
         return jnp.sum(gaussian_log_prob(segments.actions, mean, log_std), axis=1)
 
     def vae_loss(
@@ -113,7 +139,12 @@ class SkillModel:
         through them although the states carry none (they come from a rollout, or from the log).
         """
         observations = jax.lax.stop_gradient(observations)
-        repeated = jnp.broadcast_to(latent[:, None], (*observations.shape[:2], latent.shape[-1]))
-        actions = self.decode(params, observations, repeated)[0]
+        actions = self.decode_along(params, observations, latent)[0]
         recovered = self.encode(params, Segments(observations, actions)).mean
         return jnp.mean(weight * jnp.sum((recovered - latent) ** 2, axis=-1))
+
+    def _pose(self, params: dict[str, Params], observation: jax.Array) -> jax.Array:
+        return self.view.pose(params.get("view", {}), observation)
+
+    def _see(self, params: dict[str, Params], observation: jax.Array, pose: jax.Array) -> jax.Array:
+        return self.view.see(params.get("view", {}), observation, pose)

@@ -20,7 +20,10 @@ HORIZON = 3
 
 def constant_skills(action_size: int) -> Any:
     """A skill is an action."""
-    return SimpleNamespace(act=lambda params, observation, skill: jnp.resize(skill, action_size))
+    return SimpleNamespace(
+        act=lambda params, observation, skill: jnp.resize(skill, action_size),
+        begin=lambda params, latent, observation: latent,
+    )
 
 
 def rollouts(env: envs.Task, qpos: np.ndarray, qvel: np.ndarray, latent: np.ndarray) -> np.ndarray:

@@ -1,0 +1,89 @@
+"""Observations as the body sees them: from where it is, turned the way it faces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+
+@dataclass(frozen=True)
+class BodyFrame:
+    """Describe which numbers of an observation move and turn with the body, by the index of the first of each.
+
+    A pose is (x, y, cos yaw, sin yaw); without a heading in the observation the yaw is 0 and nothing is turned.
+
+    Attributes:
+        place: x and y of the body.
+        heading: the body's quaternion (w, x, y, z), or None where the observation has none.
+        points: x and y of other things in the plane.
+        quaternions: of other things.
+        vectors: x and y parts of velocities in the world's frame.
+    """
+
+    place: int = 0
+    heading: int | None = None
+    points: tuple[int, ...] = ()
+    quaternions: tuple[int, ...] = ()
+    vectors: tuple[int, ...] = ()
+
+    def pose(self, observation: jax.Array) -> jax.Array:
+        """Return (x, y, cos yaw, sin yaw)[..., 4] of ``observation[..., obs]``, in its own units."""
+        place = _pair(observation, self.place)
+        if self.heading is None:
+            facing = jnp.broadcast_to(jnp.array([1.0, 0.0]), place.shape)
+        else:
+            yaw = _yaw(_quaternion(observation, self.heading))
+            facing = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
+        return jnp.concatenate([place, facing], axis=-1)
+
+    def see(self, observation: jax.Array, pose: jax.Array) -> jax.Array:
+        """Return float[..., obs + 2 points], the observation in the frame of ``pose[..., 4]``.
+
+        Places count from the pose, and everything that has a direction is turned by minus its yaw. Behind them stands
+        each other point's place as seen from the body's present one.
+        """
+        place, facing = pose[..., :2], pose[..., 2:]
+        seen = observation
+        for index in (self.place, *self.points):
+            seen = _replace(seen, index, _turned(_pair(observation, index) - place, facing))
+        for index in self.vectors:
+            seen = _replace(seen, index, _turned(_pair(observation, index), facing))
+        if self.heading is not None:
+            for index in (self.heading, *self.quaternions):
+                seen = _replace(seen, index, _turned_quaternion(_quaternion(observation, index), facing))
+        gaps = [_pair(seen, index) - _pair(seen, self.place) for index in self.points]
+        return jnp.concatenate([seen, *gaps], axis=-1)
+
+
+def _pair(observation: jax.Array, index: int) -> jax.Array:
+    return observation[..., index : index + 2]
+
+
+def _quaternion(observation: jax.Array, index: int) -> jax.Array:
+    return observation[..., index : index + 4]
+
+
+def _replace(observation: jax.Array, index: int, value: jax.Array) -> jax.Array:
+    return observation.at[..., index : index + value.shape[-1]].set(value)
+
+
+def _yaw(quaternion: jax.Array) -> jax.Array:
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _turned(vector: jax.Array, facing: jax.Array) -> jax.Array:
+    """Return ``vector[..., 2]`` as seen by what faces (cos, sin)."""
+    (x, y), (c, s) = jnp.moveaxis(vector, -1, 0), jnp.moveaxis(facing, -1, 0)
+    return jnp.stack([c * x + s * y, c * y - s * x], axis=-1)
+
+
+def _turned_quaternion(quaternion: jax.Array, facing: jax.Array) -> jax.Array:
+    """Return the quaternion after a turn by minus the yaw; of q and -q, the same orientation, that with w >= 0."""
+    half = 0.5 * jnp.arctan2(facing[..., 1], facing[..., 0])
+    c, s = jnp.cos(half), jnp.sin(half)
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    turned = jnp.stack([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w], axis=-1)
+    return jnp.where(turned[..., :1] < 0, -turned, turned)
