@@ -14,6 +14,7 @@ import yaml
 
 from qdos_brax.config import scan
 from qdos_brax.config.layers import Layer, flat, known_keys, known_method, merged, read_values, run_layers
+from qdos_brax.config.methods import METHODS
 from qdos_brax.config.rules import choices_in, convert
 from qdos_brax.config.schema import Config, leaves, plain
 from qdos_brax.errors import UserError
@@ -170,6 +171,11 @@ def _check_together(config: Config) -> None:
         raise UserError(
             f"high_level.env_steps ({high.env_steps}) is less than one macro step of every environment "
             f"({config.skills.horizon} x {high.num_envs}); raise it with --steps"
+        )
+    returns = METHODS[config.method].weighted and config.values.estimator == "iql"
+    if returns and config.values.n_step > config.skills.horizon:
+        raise UserError(
+            f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({config.skills.horizon})"
         )
     if config.skills.advantage == "transition" and config.values.estimator == "graph":
         raise UserError("skills.advantage=transition needs values.estimator=iql; on a graph it is the same as segment")

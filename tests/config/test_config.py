@@ -172,3 +172,12 @@ def test_numbers_as_people_write_them() -> None:
     assert config.values.learning_rate == 1e-4
     assert config.high_level.hidden == (64, 32)
     assert load_config("antmaze", "paper", sets=["high_level.hidden=64"]).high_level.hidden == (64,)
+
+
+def test_the_return_of_iql_must_fit_into_a_segment() -> None:
+    """Found when the flags are read, by every command; the graph has no such return."""
+    short = {"skills.horizon": 5, "values.n_step": 10}
+    with pytest.raises(UserError, match=r"values\.n_step \(10\) must not exceed skills\.horizon \(5\)"):
+        load_config("antmaze", "smoke", {**short, "values.estimator": "iql"})
+    for other in ({"values.estimator": "graph"}, {"method": "supe"}, {"method": "iql", "skills.horizon": 1}):
+        load_config("antmaze", "smoke", {**short, **other})
