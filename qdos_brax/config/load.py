@@ -106,6 +106,21 @@ def replace(config: Config, **values: Any) -> Config:
     return _build(flat(plain(config)) | known_keys(values, "replace()"))
 
 
+def check_method(config: Config) -> None:
+    """Check that the settings suit the method; training does so before it reads or collects data.
+
+    Raises:
+        UserError: they do not.
+    """
+    method, horizon = METHODS[config.method], config.skills.horizon
+    if method.low_level == "action" and horizon != 1:
+        raise UserError(
+            f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, not {horizon}"
+        )
+    if method.weighted and config.values.estimator == "iql" and config.values.n_step > horizon:
+        raise UserError(f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({horizon})")
+
+
 def config_hash(config: Config) -> str:
     """Return 16 hex digits over everything that decides the result, which neither folders nor the ``run`` group do.
 
@@ -171,11 +186,6 @@ def _check_together(config: Config) -> None:
         raise UserError(
             f"high_level.env_steps ({high.env_steps}) is less than one macro step of every environment "
             f"({config.skills.horizon} x {high.num_envs}); raise it with --steps"
-        )
-    returns = METHODS[config.method].weighted and config.values.estimator == "iql"
-    if returns and config.values.n_step > config.skills.horizon:
-        raise UserError(
-            f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({config.skills.horizon})"
         )
     if config.skills.advantage == "transition" and config.values.estimator == "graph":
         raise UserError("skills.advantage=transition needs values.estimator=iql; on a graph it is the same as segment")

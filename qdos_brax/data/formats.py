@@ -38,7 +38,7 @@ def read(path: str | os.PathLike[str], env: Task) -> Dataset:
         UserError: unreadable, incomplete, not finite, or made for another task or action space.
     """
     rows = load(path, env.jump)
-    refuse(str(path), checks.errors(rows, env))
+    refuse(str(path), checks.prepare(rows, env))
     return label(rows, env, str(path))
 
 

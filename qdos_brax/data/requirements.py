@@ -29,6 +29,11 @@ def unmet(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
     return [*_segments(data, config), *_states(data, env, config), *_observations(data, config)]
 
 
+def remarks(data: Rows | Dataset, config: Config) -> list[str]:
+    """Return one line for each thing that training says of ``data`` and does without."""
+    return [*data.notes, *([data.mismatch] if data.mismatch and config.skills.horizon == 1 else [])]
+
+
 def refuse(source: str, lines: Sequence[str]) -> None:
     """Raise UserError with the first of ``lines``, if there are any; ``source`` is where the data came from."""
     if lines:
@@ -40,11 +45,17 @@ def _segments(data: Rows | Dataset, config: Config) -> list[str]:
     """Return a line if no segment lies within one episode."""
     horizon = config.skills.horizon
     longest = int(np.diff(episode_bounds(data.ends), axis=1).max(initial=0))
+    if data.mismatch and horizon > 1:
+        return [data.mismatch]
     if longest >= horizon:
         return []
+    order = ""
+    if data.ends.mean() > 0.5 and data.observations.shape == data.next_observations.shape:
+        apart = (data.next_observations[:-1] != data.observations[1:]).reshape(len(data.ends) - 1, -1).any(axis=1)
+        order = f"; next_observations are not the next row's observations in {apart.sum()} of {len(data.ends)} rows"
     return [
-        f"no episode has {horizon} steps, the length of a segment (longest {longest}): use --set skills.horizon=N "
-        "with a smaller N"
+        f"no episode has {horizon} steps, the length of a segment (longest {longest}){order}: use --set "
+        "skills.horizon=N with a smaller N"
     ]
 
 
@@ -74,6 +85,8 @@ def _observations(data: Rows | Dataset, config: Config) -> list[str]:
 
 def _constant(data: Rows | Dataset, config: Config) -> bool:
     """Return whether all segments begin and end with the same observation."""
+    if data.observations.shape != data.next_observations.shape:  # another fault, which the checks name
+        return False
     starts, last = segment_starts(data.ends, config.skills.horizon), config.skills.horizon - 1
     for begin in range(0, len(starts), _BLOCK):
         some = starts[begin : begin + _BLOCK]

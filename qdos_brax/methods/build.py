@@ -17,7 +17,6 @@ from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.data.requirements import refuse, unmet
-from qdos_brax.errors import UserError
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.labels.bonus import Bonus, NoBonus, RNDBonus
@@ -83,19 +82,16 @@ def build_context(config: Config, env: Any, dataset: Dataset) -> BuildContext:
     """Move the data to the device, once for all phases and members.
 
     Raises:
-        UserError: the data does not meet a need of the configuration.
+        UserError: a setting does not suit the method, or the data does not meet a need of the configuration.
     """
+    configs.check_method(config)
     refuse(dataset.source, unmet(dataset, env, config))
     data, normaliser = to_device(dataset, config.skills.horizon)
     return BuildContext(config, METHODS[config.method], env, dataset, data, normaliser)
 
 
 def build_phases(context: BuildContext) -> list[MemberPhase]:
-    """Return the phases of ``context.method`` in order, to be bound to a population.
-
-    Raises:
-        UserError: a setting does not suit the method.
-    """
+    """Return the phases of ``context.method`` in order, to be bound to a population."""
     config, method, env = context.config, context.method, context.env
     low_level = make_low_level(config, env)
     if method.policy is not None:
@@ -196,11 +192,6 @@ def _transition_phases(context: BuildContext) -> list[MemberPhase]:
 
 
 def _primitive_actions(config: Config, env: SpaceSizes) -> LowLevelPolicy:
-    if config.skills.horizon != 1:
-        raise UserError(
-            f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, "
-            f"not {config.skills.horizon}"
-        )
     return PrimitiveActions(env.action_size)
 
 

@@ -174,10 +174,12 @@ def test_numbers_as_people_write_them() -> None:
     assert load_config("antmaze", "paper", sets=["high_level.hidden=64"]).high_level.hidden == (64,)
 
 
-def test_the_return_of_iql_must_fit_into_a_segment() -> None:
-    """Found when the flags are read, by every command; the graph has no such return."""
+def test_settings_must_suit_the_method() -> None:
+    """Found before data is read or collected; the graph has no return over several steps."""
     short = {"skills.horizon": 5, "values.n_step": 10}
     with pytest.raises(UserError, match=r"values\.n_step \(10\) must not exceed skills\.horizon \(5\)"):
-        load_config("antmaze", "smoke", {**short, "values.estimator": "iql"})
+        configs.check_method(load_config("antmaze", "smoke", {**short, "values.estimator": "iql"}))
+    with pytest.raises(UserError, match=r"rlpd has no skills.*horizon must stay 1, not 5"):
+        configs.check_method(load_config("antmaze", "smoke", {**short, "method": "rlpd"}))
     for other in ({"values.estimator": "graph"}, {"method": "supe"}, {"method": "iql", "skills.horizon": 1}):
-        load_config("antmaze", "smoke", {**short, **other})
+        configs.check_method(load_config("antmaze", "smoke", {**short, **other}))
