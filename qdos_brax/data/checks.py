@@ -16,6 +16,8 @@ from qdos_brax.data.readers.rows import SAME, Rows
 from qdos_brax.data.requirements import remarks, unmet
 
 _LARGEST = 1e18  # the square of a larger number is none in float32
+_MOST_RESTING, _LEAST_RESTING = 5_000, 50  # rows whose heights are looked at, and rows that must be near the ground
+_NEAR_GROUND = 0.05  # m
 _ACTION_SLACK = 1e-3  # rounding of files stored in half precision; more than that is another action space
 
 
@@ -85,7 +87,7 @@ def inspect(rows: Rows, env: Task, config: Config, attributes: Mapping[str, Any]
     if not found.errors:  # what follows presumes right sizes and finite numbers
         found.errors += _order(rows, env)
         found.dataset = label(rows, env, source)
-        found.notes += _sameness(found.dataset)
+        found.notes += [*_sameness(found.dataset), *_recorded_before(rows, env)]
         _compare_rewards(rows, found.dataset, env, attributes, found)
     return found
 
@@ -108,6 +110,24 @@ def _sameness(dataset: Dataset) -> list[str]:
         return []
     what = {"observations": dataset.observations, "actions": dataset.actions}
     return [f"{name} are the same in every row" for name, array in what.items() if (array == array[0]).all()]
+
+
+def _recorded_before(rows: Rows, env: Task) -> list[str]:
+    """Return a note if things rest where MuJoCo before 3.5 let them rest.
+
+    A walk lifts feet and lands on them, but the median height near the ground is that at rest, within 2 mm: over
+    navigation, noise, falls and random actions, walked under the margins of then and of today.
+    """
+    if rows.qpos is None or (resting := env.resting(rows.qpos[:: -(-rows.size // _MOST_RESTING)])) is None:
+        return []
+    near = resting.heights[np.abs(resting.heights - resting.before) < _NEAR_GROUND]
+    if len(near) < _LEAST_RESTING or abs(np.median(near) - resting.before) > 0.4 * (resting.today - resting.before):
+        return []
+    return [
+        "recorded with MuJoCo before 3.5, where a contact's margin was the larger of two and not their sum: what rests "
+        f"does so {1000 * resting.before:.0f} mm above the ground, today {1000 * resting.today:.0f} mm; rollouts from "
+        "these states begin by rising"
+    ]
 
 
 def _sizes(rows: Rows, env: Task) -> list[str]:
