@@ -9,7 +9,7 @@ import pytest
 
 import envs
 from qdos_brax.commands.main import main
-from qdos_brax.config import load_config
+from qdos_brax.config import load_config, replace
 from qdos_brax.data import checks, formats
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
@@ -104,6 +104,38 @@ def test_rewards_are_compared_with_the_task(env: envs.Task) -> None:
     ]
     found = findings(rows, env, "antmaze-medium-task2")
     assert found.errors == [] and "rewards of another task or goal in 2 rows (first 4)" in found.notes[2]
+
+
+def test_what_never_changes_is_said(env: envs.Task) -> None:
+    rows = walk()
+    assert rows.qpos is not None
+    at_goal = env.goal_xy  # type: ignore[attr-defined]
+    for array in (rows.observations, rows.next_observations, rows.qpos):
+        array[:, :2] = at_goal
+    found = findings(rows, env)
+    assert (
+        len(found.errors) == 1 and "estimator=iql" in found.errors[0]
+    )  # by the graph no state can be told from another
+    iql = replace(CONFIG, **{"values.estimator": "iql"})
+    assert checks.inspect(rows, env, iql, {}, "the walk").notes == [
+        "observations are the same in every row",
+        "actions are the same in every row",
+        "every row is at the task's goal: no reward to learn from",
+    ]
+    rows = walk()
+    rows.rewards, rows.qpos, rows.qvel = np.zeros(120, np.float32), None, None
+    logged = replace(CONFIG, **{"skills.mi_rollout": "logged"})
+    assert "every reward is -1: no reward to learn from" in checks.inspect(rows, env, logged, {}, "the walk").notes
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_row_is_enough_for_single_transitions(env: envs.Task, count: int) -> None:
+    rows = walk()
+    rows.drop(np.arange(120) >= count)
+    config = load_config(TASK, "smoke", {"method": "rlpd"})
+    found = checks.inspect(rows, env, config, {}, "the walk")
+    assert found.errors == [] and found.dataset is not None and found.dataset.size == count
+    assert len(findings(rows, env).errors) == 1
 
 
 def test_lengths_are_compared_with_horizon_and_cap(env: envs.Task) -> None:
