@@ -180,7 +180,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.map:
         _draw_map(args.map, rows, env, path.name)
     dataset = found.dataset
-    if found.errors or dataset is None:
+    if found.errors or dataset is None:  # never without errors
         return _UNUSABLE
     episodes = dataset.episode_bounds
     reached = sum(1 for first, stop in episodes if (dataset.masks[first:stop] == 0).any())

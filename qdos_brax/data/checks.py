@@ -28,7 +28,7 @@ class Findings:
     Attributes:
         errors: what forbids the use for the task.
         notes: what does not.
-        dataset: the labelled rows; None if there are errors.
+        dataset: the labelled rows; None where sizes or numbers are wrong.
     """
 
     errors: list[str] = field(default_factory=list)
@@ -79,12 +79,12 @@ def inspect(rows: Rows, env: Task, config: Config, attributes: Mapping[str, Any]
         attributes: the file's; ``env`` names the task that its rewards were made for.
         source: where the rows came from.
     """
-    found = Findings(prepare(rows, env))
-    found.notes += remarks(rows, config)
+    faults = prepare(rows, env)
+    found = Findings(list(faults), remarks(rows, config))
     if rows.size:
         found.errors += unmet(rows, env, config)
         found.notes += _lengths(rows, env, config.skills.horizon)
-    if not found.errors:  # what follows presumes right sizes and finite numbers
+    if not faults:  # what follows presumes right sizes and finite numbers
         found.errors += _order(rows, env)
         found.dataset = label(rows, env, source)
         found.notes += [*_sameness(found.dataset), *_recorded_before(rows, env)]

@@ -106,6 +106,14 @@ def test_rewards_are_compared_with_the_task(env: envs.Task) -> None:
     assert found.errors == [] and "rewards of another task or goal in 2 rows (first 4)" in found.notes[2]
 
 
+def test_what_training_needs_hides_no_other_fault(env: envs.Task) -> None:
+    rows = walk()
+    _set(rows.next_observations, (50, 20), 1.0)
+    rows.qvel = None
+    (needed, order) = findings(rows, env).errors
+    assert "no qvel" in needed and "not the row that follows in 1 row (first 50)" in order
+
+
 def test_what_never_changes_is_said(env: envs.Task) -> None:
     rows = walk()
     assert rows.qpos is not None
