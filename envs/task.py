@@ -68,6 +68,22 @@ class FloorMap(NamedTuple):
         return self.corner + (np.argwhere(self.grid == 1)[:, ::-1] + 0.5) * self.cell
 
 
+class Resting(NamedTuple):
+    """Hold how high something lies and where it rests, which shows the MuJoCo that recorded it.
+
+    Up to MuJoCo 3.4 two geoms met at the larger of their margins, since 3.5 at the sum: the same thing rests higher.
+
+    Attributes:
+        heights: float64[N], of the states asked about, in m.
+        today: the height at rest with the installed MuJoCo.
+        before: that with MuJoCo before 3.5.
+    """
+
+    heights: np.ndarray
+    today: float
+    before: float
+
+
 class Task(Env, ABC):
     """Simulate one task; subclasses say where episodes start, what success is and what is observed.
 
@@ -75,7 +91,8 @@ class Task(Env, ABC):
     ``step`` never resets: see ``envs.AutoReset``.
 
     What not every task can do has a member all the same, which is None where the task cannot: ``position``,
-    ``floor_map``, ``distance_left``, ``body_frame``. Maps, paths, reports and checks leave out what is None.
+    ``floor_map``, ``distance_left``, ``resting``, ``body_frame``. Maps, paths, reports and checks leave out what is
+    None.
 
     Args:
         spec: which task.
@@ -220,6 +237,10 @@ class Task(Env, ABC):
 
         A way in units of length, or a count of what is still to be done; inf where there is no way.
         """
+        return None
+
+    def resting(self, qpos: np.ndarray) -> Resting | None:
+        """Return how high things lie at ``qpos[N, nq]``, and where they rest, of a task whose contacts have margins."""
         return None
 
 

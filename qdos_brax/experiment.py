@@ -23,6 +23,7 @@ from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
 from qdos_brax.data import download, formats
 from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.requirements import remarks
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.methods.build import bind_phases, build_context, build_phases, plan_members
@@ -78,6 +79,8 @@ def start(
     if first.dataset:
         download.check(first.dataset)
     observers.check(first.run)
+    for config in asked.values():
+        configs.check_method(config)
     env = _make_env(first)
     if hosts.count > 1 and len(asked) > 1:
         raise UserError("--distributed shares the members of one run; give one method and one value of each size")
@@ -221,6 +224,8 @@ def _load_data(config: Config) -> _Data:
     path, digest = _data_file(config, env)
     print(f"data      {path}", flush=True)
     dataset = formats.read(path, env)
+    for line in remarks(dataset, config):
+        print(f"note      {line}", flush=True)
     return _Data(env, path, digest or sha256(path), dataset, time.perf_counter() - before)
 
 

@@ -52,7 +52,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return [kind(phase.name, phase.num_chunks) for phase in toy.phases()]
 
     monkeypatch.setattr(experiment, "_data_file", lambda config, env: (data, None))
-    monkeypatch.setattr(experiment.formats, "read", lambda path, env: None)
+    monkeypatch.setattr(experiment.formats, "read", lambda path, env: SimpleNamespace(notes=(), mismatch=""))
     context = lambda config, env, dataset: SimpleNamespace(config=config, data=None)  # noqa: E731
     monkeypatch.setattr(experiment, "build_context", context)
     monkeypatch.setattr(experiment, "build_phases", phases)

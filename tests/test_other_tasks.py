@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,9 +21,10 @@ import envs
 from envs import gym_api, gym_programs, render
 from qdos_brax.commands.main import main
 from qdos_brax.commands.train import train_main
+from qdos_brax.config import load_config
 from qdos_brax.data import checks, formats
 from qdos_brax.data.device import to_device
-from qdos_brax.errors import UserError
+from qdos_brax.data.requirements import unmet
 from qdos_brax.skills.information import PhysicsRollout
 from tests import reacher
 
@@ -169,16 +171,15 @@ def test_states_without_their_discrete_part_are_refused(env: reacher.Reacher, fi
     assert "states are not whole" in checks.errors(rows, env)[0]
     rows.extra = np.zeros((rows.size, 3), np.int32)
     assert "extra has 3 numbers per row, reacher has 1" in checks.errors(rows, env)[0]
-    dataset = formats.read(file, env)
-    without, _ = to_device(SimpleNamespace(**vars(dataset) | {"extra": None}), HORIZON)
-    with pytest.raises(UserError, match=r"no discrete state.*mi_rollout=logged"):
-        PhysicsRollout(env, SimpleNamespace(), lambda obs: obs, HORIZON, without)
+    without = replace(formats.read(file, env), extra=None)
+    (line,) = unmet(without, env, load_config("reacher", "smoke", {"skills.horizon": HORIZON}))
+    assert "no infos/extra, the simulator states" in line and "mi_rollout=logged" in line
 
 
 def test_rollouts_of_skills_start_from_the_whole_state(env: reacher.Reacher, file: Path) -> None:
     data, _ = to_device(formats.read(file, env), HORIZON)
     skills: Any = SimpleNamespace(act=lambda params, observation, skill: skill)
-    rollout = PhysicsRollout(env, skills, lambda observation: observation, HORIZON, data)
+    rollout = PhysicsRollout(env, skills, lambda observation: observation, HORIZON)
     starts = data.starts[::400]
     latent = np.random.default_rng(0).uniform(-1, 1, (len(starts), 2)).astype(np.float32)
     seen = np.asarray(jax.jit(lambda data, starts, latent: rollout({}, data, starts, latent))(data, starts, latent))

@@ -16,8 +16,10 @@ from envs.mazes.families import cells_of
 from envs.mazes.maze import UNIT, WALL_HALF_SIZE, get_maze
 from envs.mazes.maze_task import RESET_NOISE, MazeTask
 from envs.mazes.models import humanoid_model
+from envs.mazes.resting import lowest_points
 from envs.physics import PipelineState
 from envs.scene import Scene, following_view, top_view
+from envs.task import Resting
 
 DROP_HEIGHT = 1.5  # m
 
@@ -56,6 +58,14 @@ class BodyTask(MazeTask):
         top = top_view(centre, (columns * UNIT / 2, rows * UNIT / 2), 2 * WALL_HALF_SIZE[2])
         cameras = {"top": top, "follow": following_view(_FIRST_BODY)}
         return Scene(self.whole_model(), cameras, columns / rows, goal_marker="target")
+
+    def resting(self, qpos: np.ndarray) -> Resting | None:
+        """Return the heights of the body's lowest point, and at rest; before MuJoCo 3.5 that was one margin less."""
+        if self.body.rest is None:
+            return None
+        model = self.whole_model()
+        heights = lowest_points(model, qpos, _FIRST_BODY)
+        return Resting(heights, self.body.rest, self.body.rest - float(model.geom("floor").margin[0]))
 
 
 class AntMaze(BodyTask):

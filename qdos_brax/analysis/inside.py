@@ -167,9 +167,7 @@ class _LatentView:
         latents = np.asarray(self._posterior(artifacts["skills"], self._segments, self._after).mean)
         if not np.isfinite(latents).all():  # the member was frozen
             return {}
-        found: Arrays = {"latent": latents}
-        if len(latents) > _GRID:
-            found["tsne"] = _tsne(latents)
+        found = {"latent": latents, **embedded(latents)}
         if self._trained.env.floor_map() is None:
             return found
         grid, between = _grid(latents), _between(latents)
@@ -197,11 +195,14 @@ def _place_of_body(env: Any, qpos: Any) -> Any:
     return next(iter(env.position(qpos).values()))
 
 
-def _tsne(latents: np.ndarray) -> np.ndarray:
-    """Return float32[n, 2], the t-SNE embedding."""
+def embedded(latents: np.ndarray) -> Arrays:
+    """Return the t-SNE embedding float32[n, 2] of latents[n, z] as ``tsne``; nothing of few, or if all are the same."""
+    if len(latents) <= _GRID or (latents == latents[0]).all():  # scikit-learn dies of equal ones: no exception
+        return {}
+    latents = np.pad(latents, ((0, 0), (0, max(0, 2 - latents.shape[1]))))  # it starts from two principal components
     perplexity = min(30.0, (len(latents) - 1) / 3)
     with threadpool_limits(1):  # on few cores its threads can wait for each other without end
-        return np.asarray(TSNE(perplexity=perplexity, init="pca", random_state=_SEED).fit_transform(latents))
+        return {"tsne": TSNE(perplexity=perplexity, init="pca", random_state=_SEED).fit_transform(latents)}
 
 
 def _main_directions(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

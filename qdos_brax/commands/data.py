@@ -13,9 +13,9 @@ from qdos_brax.collection import recipes
 from qdos_brax.collection.collector import Collector
 from qdos_brax.collection.default_set import make_file
 from qdos_brax.collection.profiles import profile_of
+from qdos_brax.config import Config, check_method, load_config
 from qdos_brax.data import checks, download, formats, sources
 from qdos_brax.data.dataset import episode_bounds
-from qdos_brax.data.labelling import label
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
@@ -74,7 +74,13 @@ def add_parser(commands: Any) -> None:
     check = actions.add_parser("check", help="check whether a data file fits a task; exit code 2 if not")
     check.add_argument("file", metavar="FILE", help=what)
     check.add_argument("--env", metavar="TASK", required=True, help="the task to use it for")
-    check.add_argument("--horizon", metavar="H", type=int, default=20, help="steps of a segment (default 20)")
+    check.add_argument(
+        "--method", metavar="NAME", default=Config.method, help=f"the method to train with (default {Config.method})"
+    )
+    check.add_argument("--horizon", metavar="H", help="steps of a segment (default: the method's)")
+    check.add_argument(
+        "--set", metavar="KEY=VALUE", action="append", default=[], help="as for train.py; may be repeated"
+    )
     check.add_argument("--map", metavar="FILE", help="also draw the positions in the data, as .png")
     check.set_defaults(run=_check)
 
@@ -122,13 +128,20 @@ def _info(args: argparse.Namespace) -> int:
     rows, attributes = formats.load(path), formats.read_attrs(path)
     for name, value in attributes.items():
         print(f"{name:18s} {value}")
+    unknown = rows.unknown_next
     for name, array in rows.arrays().items():
+        if array is unknown:
+            continue  # no array of the file's
         print(f"{name:18s} {array.dtype} {'x'.join(map(str, array.shape))}")
     print(f"{'transitions':18s} {rows.size:,}")
     if rows.size:
         _describe(rows)
-    for line in rows.notes:
+    for line in filter(None, (*rows.notes, rows.mismatch)):
         print(f"note: {line}")
+    if unknown is not None and unknown.any():
+        print(
+            f"note: no next_observations: {unknown.sum()} terminal rows that end an episode count where the task ends"
+        )
     if args.map:
         task = args.env or attributes.get("env")
         if not task:
@@ -153,21 +166,22 @@ def _describe(rows: Rows) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    if args.horizon < 1:
-        raise UserError(f"--horizon must be at least 1, got {args.horizon}")
+    flags = {"method": args.method, "skills.horizon": args.horizon}
+    config = load_config(args.env, None, {key: value for key, value in flags.items() if value is not None}, args.set)
+    check_method(config)
     env = _env(args.env, "mujoco")
     path = download.resolve(args.file).path
     rows = formats.load(path, env.jump)
-    found = checks.inspect(rows, env, args.horizon, formats.read_attrs(path))
+    found = checks.inspect(rows, env, config, formats.read_attrs(path), str(path))
     for line in found.errors:
         print(f"error: {line}")
     for line in found.notes:
         print(f"note: {line}")
     if args.map:
         _draw_map(args.map, rows, env, path.name)
-    if found.errors:
+    dataset = found.dataset
+    if found.errors or dataset is None:  # never without errors
         return _UNUSABLE
-    dataset = label(rows, env, str(path))
     episodes = dataset.episode_bounds
     reached = sum(1 for first, stop in episodes if (dataset.masks[first:stop] == 0).any())
     print(f"{args.file} fits {env.spec.full_name}: {dataset.size:,} transitions, {len(episodes):,} episodes")

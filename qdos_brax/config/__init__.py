@@ -16,6 +16,7 @@ from __future__ import annotations
 from qdos_brax.config.baseline_groups import DiveOffConfig, GuideConfig, HilbertConfig, PolicyConfig
 from qdos_brax.config.layers import Layer, default_preset, families, family_layers, presets, run_layers
 from qdos_brax.config.load import (
+    check_method,
     config_hash,
     from_layers,
     from_yaml,
@@ -47,6 +48,7 @@ __all__ = [
     "ScanConfig",
     "SkillsConfig",
     "ValuesConfig",
+    "check_method",
     "config_hash",
     "default_preset",
     "families",

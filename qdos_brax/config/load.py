@@ -14,6 +14,7 @@ import yaml
 
 from qdos_brax.config import scan
 from qdos_brax.config.layers import Layer, flat, known_keys, known_method, merged, read_values, run_layers
+from qdos_brax.config.methods import METHODS
 from qdos_brax.config.rules import choices_in, convert
 from qdos_brax.config.schema import Config, leaves, plain
 from qdos_brax.errors import UserError
@@ -103,6 +104,21 @@ def replace(config: Config, **values: Any) -> Config:
         UserError: a key is unknown, or a value is wrong.
     """
     return _build(flat(plain(config)) | known_keys(values, "replace()"))
+
+
+def check_method(config: Config) -> None:
+    """Check that the settings suit the method; training does so before it reads or collects data.
+
+    Raises:
+        UserError: they do not.
+    """
+    method, horizon = METHODS[config.method], config.skills.horizon
+    if method.low_level == "action" and horizon != 1:
+        raise UserError(
+            f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, not {horizon}"
+        )
+    if method.weighted and config.values.estimator == "iql" and config.values.n_step > horizon:
+        raise UserError(f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({horizon})")
 
 
 def config_hash(config: Config) -> str:

@@ -9,19 +9,31 @@ from typing import Any
 import numpy as np
 
 from envs.task import Task, count_rows
-from qdos_brax.data.dataset import episode_bounds
-from qdos_brax.data.labelling import drop_unknown, task_labels
+from qdos_brax.config import Config
+from qdos_brax.data.dataset import Dataset, episode_bounds
+from qdos_brax.data.labelling import drop_unknown, label
 from qdos_brax.data.readers.rows import SAME, Rows
+from qdos_brax.data.requirements import remarks, unmet
 
+_LARGEST = 1e18  # the square of a larger number is none in float32
+_MOST_RESTING, _LEAST_RESTING = 5_000, 50  # rows whose heights are looked at, and rows that must be near the ground
+_NEAR_GROUND = 0.05  # m
 _ACTION_SLACK = 1e-3  # rounding of files stored in half precision; more than that is another action space
 
 
 @dataclass
 class Findings:
-    """Hold one line each: ``errors`` forbid the use for the task, ``notes`` do not."""
+    """Hold one line each, and what training would read.
+
+    Attributes:
+        errors: what forbids the use for the task.
+        notes: what does not.
+        dataset: the labelled rows; None where sizes or numbers are wrong.
+    """
 
     errors: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    dataset: Dataset | None = None
 
 
 def errors(rows: Rows, env: Task) -> list[str]:
@@ -31,9 +43,11 @@ def errors(rows: Rows, env: Task) -> list[str]:
     lines = _sizes(rows, env)
     for key in ("observations", "actions", "next_observations", "rewards", "terminals", "qpos", "qvel"):
         array = getattr(rows, key)
-        if array is not None and not np.isfinite(array).all():
-            bad = ~np.isfinite(array).reshape(rows.size, -1).all(axis=1)
-            lines.append(f"{key} has NaN or infinity in {count_rows(bad)}: remove them")
+        if array is not None and not -_LARGEST < array.min(initial=0) <= array.max(initial=0) < _LARGEST:
+            finite = np.isfinite(array).all()
+            bad = ~(np.abs(array) < _LARGEST).reshape(rows.size, -1).all(axis=1)
+            what = f"numbers beyond {_LARGEST:g}" if finite else "NaN or infinity"
+            lines.append(f"{key} has {what} in {count_rows(bad)}: remove them")
     over = float(max(rows.actions.max(initial=0.0), -rows.actions.min(initial=0.0)))
     if over > 1.0 + _ACTION_SLACK:
         lines.append(f"actions reach {over:.3g}, the task takes [-1, 1]: scale them")
@@ -42,43 +56,78 @@ def errors(rows: Rows, env: Task) -> list[str]:
     return lines or env.check_rows(rows)
 
 
-def inspect(rows: Rows, env: Task, horizon: int, attributes: Mapping[str, Any]) -> Findings:
-    """Return everything that is found in ``rows``.
+def prepare(rows: Rows, env: Task) -> list[str]:
+    """Drop, in place, what nothing can be learned from; return what makes ``rows`` unusable for ``env``.
 
-    Args:
-        rows: as a reader made them.
-        env: the task.
-        horizon: steps of a segment.
-        attributes: the file's; ``env`` names the task that its rewards were made for.
+    Every training begins with it, and ``data check``.
     """
     lines = errors(rows, env)
     if not lines:
         drop_unknown(rows, env)
-        lines = errors(rows, env)
-    found = Findings(lines, list(rows.notes))
-    if rows.size == 0:
-        return found
-    horizon_errors, horizon_notes = horizon_lines(rows.ends, horizon)
-    found.errors += horizon_errors
-    found.notes += horizon_notes
-    lengths = np.diff(episode_bounds(rows.ends), axis=1)
-    if (longest := int(lengths.max())) > env.episode_length:
-        found.notes.append(f"the longest episode has {longest} steps, {env.spec.name} ends after {env.episode_length}")
-    if not found.errors:  # what follows presumes right sizes and finite numbers
+        if not rows.size:
+            lines = [f"no transitions are left: {rows.notes.pop()}"]
+    return lines
+
+
+def inspect(rows: Rows, env: Task, config: Config, attributes: Mapping[str, Any], source: str) -> Findings:
+    """Return everything that is found in ``rows``, which are prepared for ``env`` in place.
+
+    Args:
+        rows: as a reader made them.
+        env: the task.
+        config: the configuration to train with.
+        attributes: the file's; ``env`` names the task that its rewards were made for.
+        source: where the rows came from.
+    """
+    faults = prepare(rows, env)
+    found = Findings(list(faults), remarks(rows, config))
+    if rows.size:
+        found.errors += unmet(rows, env, config)
+        found.notes += _lengths(rows, env, config.skills.horizon)
+    if not faults:  # what follows presumes right sizes and finite numbers
         found.errors += _order(rows, env)
-        _compare_rewards(rows, env, attributes, found)
+        found.dataset = label(rows, env, source)
+        found.notes += [*_sameness(found.dataset), *_recorded_before(rows, env)]
+        _compare_rewards(rows, found.dataset, env, attributes, found)
     return found
 
 
-def horizon_lines(ends: np.ndarray, horizon: int) -> tuple[list[str], list[str]]:
-    """Return (errors, notes) on how the episodes fit windows of ``horizon`` steps."""
-    bounds = episode_bounds(ends)
-    lengths = bounds[:, 1] - bounds[:, 0]
-    short = int((lengths < horizon).sum())
-    if short == len(lengths):
-        return [f"no episode has {horizon} steps (longest {lengths.max()}): use a shorter segment horizon"], []
-    note = f"{short} of {len(lengths)} episodes are shorter than {horizon} steps and give no segment"
-    return [], [note] if short else []
+def _lengths(rows: Rows, env: Task, horizon: int) -> list[str]:
+    """Return notes on episodes that are too short for a segment, or longer than the task's."""
+    lengths = np.diff(episode_bounds(rows.ends), axis=1)
+    short, longest = int((lengths < horizon).sum()), int(lengths.max())
+    lines = []
+    if 0 < short < len(lengths):
+        lines.append(f"{short} of {len(lengths)} episodes are shorter than {horizon} steps and give no segment")
+    if longest > env.episode_length:
+        lines.append(f"the longest episode has {longest} steps, {env.spec.name} ends after {env.episode_length}")
+    return lines
+
+
+def _sameness(dataset: Dataset) -> list[str]:
+    """Return notes on what never changes, where there is more than one row."""
+    if dataset.size < 2:
+        return []
+    what = {"observations": dataset.observations, "actions": dataset.actions}
+    return [f"{name} are the same in every row" for name, array in what.items() if (array == array[0]).all()]
+
+
+def _recorded_before(rows: Rows, env: Task) -> list[str]:
+    """Return a note if things rest where MuJoCo before 3.5 let them rest.
+
+    A walk lifts feet and lands on them, but the median height near the ground is that at rest, within 2 mm: over
+    navigation, noise, falls and random actions, walked under the margins of then and of today.
+    """
+    if rows.qpos is None or (resting := env.resting(rows.qpos[:: -(-rows.size // _MOST_RESTING)])) is None:
+        return []
+    near = resting.heights[np.abs(resting.heights - resting.before) < _NEAR_GROUND]
+    if len(near) < _LEAST_RESTING or abs(np.median(near) - resting.before) > 0.4 * (resting.today - resting.before):
+        return []
+    return [
+        "recorded with MuJoCo before 3.5, where a contact's margin was the larger of two and not their sum: what rests "
+        f"does so {1000 * resting.before:.0f} mm above the ground, today {1000 * resting.today:.0f} mm; rollouts from "
+        "these states begin by rising"
+    ]
 
 
 def _sizes(rows: Rows, env: Task) -> list[str]:
@@ -118,16 +167,18 @@ def _apart(some: np.ndarray, other: np.ndarray) -> np.ndarray:
         return np.abs(some - other).max(axis=1) > SAME
 
 
-def _compare_rewards(rows: Rows, env: Task, attributes: Mapping[str, Any], found: Findings) -> None:
+def _compare_rewards(rows: Rows, dataset: Dataset, env: Task, attributes: Mapping[str, Any], found: Findings) -> None:
     if rows.qpos is None:
         found.notes.append("no simulator states: rewards and masks are the file's own, of whatever task that was")
+        if (dataset.rewards == dataset.rewards[0]).all():
+            found.notes.append(f"every reward is {dataset.rewards[0]:g}: no reward to learn from")
         return
-    rewards, masks = task_labels(rows, env)
-    if not (masks == 0).any():
-        found.notes.append("no row is at the task's goal: no reward to learn from")
+    at_goal = dataset.masks == 0
+    if at_goal.all() or not at_goal.any():
+        found.notes.append(f"{'every' if at_goal.all() else 'no'} row is at the task's goal: no reward to learn from")
     if rows.rewards is None:
         return
-    differ = env.file_rewards(rows.rewards) != rewards
+    differ = env.file_rewards(rows.rewards) != dataset.rewards
     if not differ.any():
         return
     where, name = count_rows(differ), env.spec.full_name

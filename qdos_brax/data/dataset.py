@@ -24,6 +24,8 @@ class Dataset:
         extra: int32[N, e], discrete state before the action, or None.
         quality: int8[N], what produced the step (``quality.QUALITY``), or None. For measuring, never for training.
         source: where the rows came from, for messages.
+        notes: what the reader had to correct or leave out, one line each.
+        mismatch: how next observations miss the rows that follow; "" where they do not. See ``Rows``.
     """
 
     observations: np.ndarray
@@ -37,6 +39,8 @@ class Dataset:
     extra: np.ndarray | None = None
     quality: np.ndarray | None = None
     source: str = ""
+    notes: tuple[str, ...] = ()
+    mismatch: str = ""
 
     @property
     def size(self) -> int:

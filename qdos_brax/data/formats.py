@@ -20,6 +20,7 @@ from qdos_brax.data.labelling import label
 from qdos_brax.data.readers import d4rl, minari, ogbench
 from qdos_brax.data.readers.rows import Rows, unreadable
 from qdos_brax.data.readers.table import CHECKSUMS, checksum
+from qdos_brax.data.requirements import refuse
 from qdos_brax.errors import UserError
 from qdos_brax.files import replacing, user_errors
 
@@ -37,10 +38,7 @@ def read(path: str | os.PathLike[str], env: Task) -> Dataset:
         UserError: unreadable, incomplete, not finite, or made for another task or action space.
     """
     rows = load(path, env.jump)
-    lines = checks.errors(rows, env)
-    if lines:
-        more = f" (and {len(lines) - 1} more, see: data check)" if len(lines) > 1 else ""
-        raise UserError(f"{path}: {lines[0]}{more}")
+    refuse(str(path), checks.prepare(rows, env))
     return label(rows, env, str(path))
 
 

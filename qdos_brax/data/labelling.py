@@ -10,14 +10,13 @@ from qdos_brax.data.readers.rows import Rows
 
 
 def label(rows: Rows, env: Task, source: str) -> Dataset:
-    """Return the data set of checked ``rows``, whose arrays it takes over.
+    """Return the data set of ``rows``, whose arrays it takes over.
 
     Args:
-        rows: with ``qpos`` or ``rewards``.
+        rows: as ``checks.prepare`` left them without finding a fault.
         env: the task; its ``labels`` of the states before the action decide, as online.
         source: where the rows came from, for messages.
     """
-    drop_unknown(rows, env)
     rewards, masks = task_labels(rows, env)
     return Dataset(
         observations=rows.observations,
@@ -31,6 +30,8 @@ def label(rows: Rows, env: Task, source: str) -> Dataset:
         extra=rows.extra,
         quality=rows.quality,
         source=source,
+        notes=tuple(rows.notes),
+        mismatch=rows.mismatch,
     )
 
 
@@ -45,7 +46,7 @@ def drop_unknown(rows: Rows, env: Task) -> None:
     gone = int(dropped.sum())
     rows.notes.append(
         f"no next_observations: of {unknown.sum()} terminal rows that end an episode, {unknown.sum() - gone} are kept "
-        f"and {gone} dropped, where {env.spec.name} goes on"
+        f"and {gone} dropped, where {env.spec.full_name} goes on"
     )
 
 

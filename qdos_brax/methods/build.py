@@ -17,7 +17,7 @@ from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, Normaliser, to_device
-from qdos_brax.errors import UserError
+from qdos_brax.data.requirements import refuse, unmet
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.labels.bonus import Bonus, NoBonus, RNDBonus
@@ -85,23 +85,16 @@ def build_context(config: Config, env: Any, dataset: Dataset) -> BuildContext:
     """Move the data to the device, once for all phases and members.
 
     Raises:
-        UserError: no episode is as long as a segment.
+        UserError: a setting does not suit the method, or the data does not meet a need of the configuration.
     """
+    configs.check_method(config)
+    refuse(dataset.source, unmet(dataset, env, config))
     data, normaliser = to_device(dataset, config.skills.horizon)
-    if data.starts.shape[0] == 0:
-        raise UserError(
-            f"no episode of {dataset.source} has {config.skills.horizon} steps, the length of a skill "
-            "(--set skills.horizon=N shortens it)"
-        )
     return BuildContext(config, METHODS[config.method], env, dataset, data, normaliser)
 
 
 def build_phases(context: BuildContext) -> list[MemberPhase]:
-    """Return the phases of ``context.method`` in order, to be bound to a population.
-
-    Raises:
-        UserError: the data cannot serve this configuration.
-    """
+    """Return the phases of ``context.method`` in order, to be bound to a population."""
     config, method, env = context.config, context.method, context.env
     low_level = make_low_level(config, env)
     if method.policy is not None:
@@ -169,10 +162,6 @@ def _trajectory_skills(config: Config, env: SpaceSizes) -> LowLevelPolicy:
 
 def _trajectory_phases(context: BuildContext) -> list[MemberPhase]:
     config, method = context.config, context.method
-    if method.weighted and config.values.n_step > config.skills.horizon:
-        raise UserError(
-            f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({config.skills.horizon})"
-        )
     model = make_skill_model(config, context.env)
     view = fit_view(model.view, context.data, context.normaliser, config.skills.horizon)
     skills = SkillPhase(config, model, _weights(config, method, context.env), _information(context, model), view)
@@ -208,11 +197,6 @@ def _transition_phases(context: BuildContext) -> list[MemberPhase]:
 
 
 def _primitive_actions(config: Config, env: SpaceSizes) -> LowLevelPolicy:
-    if config.skills.horizon != 1:
-        raise UserError(
-            f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, "
-            f"not {config.skills.horizon}"
-        )
     return PrimitiveActions(env.action_size)
 
 
@@ -303,7 +287,7 @@ def _information(context: BuildContext, model: SkillModel) -> Information | None
         return None
     if skills.mi_rollout == "logged":
         return LoggedStates(skills.horizon)
-    return PhysicsRollout(context.env, model, context.normaliser, skills.horizon, context.data)
+    return PhysicsRollout(context.env, model, context.normaliser, skills.horizon)
 
 
 def _labeller(context: BuildContext, low_level: LowLevelPolicy) -> OfflineReward:

@@ -79,7 +79,12 @@ def graph_costs(values: ValuesConfig, horizon: int, data: DeviceData, ends: np.n
     features = slow_features(observations, next_observations, np.asarray(data.starts), horizon, values.slowness)
     costs = step_costs(np.asarray(data.rewards))
     if costs.min() > 0:
-        print("values    no success in the data: all segments will count the same", file=sys.stderr, flush=True)
+        what = "no success in the data" if np.all(data.masks) else "rewards do not tell success apart"
+        print(
+            f"values    {what}, every reward is {data.rewards[0]:g}: all segments will count the same",
+            file=sys.stderr,
+            flush=True,
+        )
     return costs_to_go(
         features,
         costs,

@@ -11,7 +11,6 @@ from brax.envs.base import State
 from envs.task import Task
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.data.segments import window
-from qdos_brax.errors import UserError
 from qdos_brax.skills.vae import SkillModel
 
 
@@ -23,21 +22,9 @@ class PhysicsRollout:
         model: the skills.
         normaliser: of observations.
         horizon: H.
-        data: the data set, which must hold simulator states.
-
-    Raises:
-        UserError: it holds none.
     """
 
-    def __init__(self, env: Task, model: SkillModel, normaliser: Normaliser, horizon: int, data: DeviceData) -> None:
-        if data.qpos is None or data.qvel is None:
-            raise UserError(
-                "the data set holds no qpos and qvel to start rollouts from; use --set skills.mi_rollout=logged"
-            )
-        if env.extra_size and data.extra is None:
-            raise UserError(
-                "the data set holds no discrete state to start rollouts from; use --set skills.mi_rollout=logged"
-            )
+    def __init__(self, env: Task, model: SkillModel, normaliser: Normaliser, horizon: int) -> None:
         self._env, self._model, self._normalise, self._horizon = env, model, normaliser, horizon
 
     def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
@@ -53,7 +40,7 @@ class PhysicsRollout:
 
             return jax.lax.scan(step, start, None, length=self._horizon)[1]
 
-        assert data.qpos is not None and data.qvel is not None  # refused in __init__
+        assert data.qpos is not None and data.qvel is not None  # data.requirements saw to it
         # What the physics draws (a teleporter's exit), it draws from the key of the logged state, for all skills.
         keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(starts)
         extra = None if data.extra is None else data.extra[starts]

@@ -8,6 +8,8 @@ map of Noe et al. (2016) up to a factor: distances then count in lags, the time 
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import scipy.linalg
 
@@ -19,11 +21,11 @@ def slow_features(
     observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, lag: int, slowness: float
 ) -> np.ndarray:
     """Return the features whose autocorrelation over ``lag`` steps is at least ``slowness``; the slowest one in
-    any case.
+    any case, and a line says so if none other is left.
 
     Args:
         observations: float[N, obs], normalised per column.
-        next_observations: float[N, obs].
+        next_observations: float[N, obs]; both together not constant over the windows (``data.requirements``).
         starts: int[S], S >= 1, first rows of the windows of ``lag`` rows inside one episode.
         lag: steps.
         slowness: 0 to 1.
@@ -42,7 +44,15 @@ def slow_features(
     kept = variance > _SMALLEST_VARIANCE * variance[-1]
     whiten = axes[:, kept] / np.sqrt(variance[kept])
     autocorrelation, rotation = scipy.linalg.eigh(whiten.T @ lagged @ whiten)
-    slow = autocorrelation >= min(slowness, autocorrelation[-1])
+    largest = autocorrelation[-1]
+    if largest < slowness:
+        print(
+            f"values    no feature of the observations has an autocorrelation of values.slowness={slowness:g} over "
+            f"{lag} steps: the slowest alone is used, with {largest:.2f}; --set values.slowness=N lowers the bound",
+            file=sys.stderr,
+            flush=True,
+        )
+    slow = autocorrelation >= min(slowness, largest)
     change = 2 * np.maximum(1 - autocorrelation[slow], _SMALLEST_CHANGE)  # mean square, of a feature of variance 1
     directions = whiten @ rotation[:, slow] / np.sqrt(change)
     return np.ascontiguousarray(((observations - mean) @ directions)[:, ::-1], np.float32)

@@ -172,3 +172,14 @@ def test_numbers_as_people_write_them() -> None:
     assert config.values.learning_rate == 1e-4
     assert config.high_level.hidden == (64, 32)
     assert load_config("antmaze", "paper", sets=["high_level.hidden=64"]).high_level.hidden == (64,)
+
+
+def test_settings_must_suit_the_method() -> None:
+    """Found before data is read or collected; the graph has no return over several steps."""
+    short = {"skills.horizon": 5, "values.n_step": 10}
+    with pytest.raises(UserError, match=r"values\.n_step \(10\) must not exceed skills\.horizon \(5\)"):
+        configs.check_method(load_config("antmaze", "smoke", {**short, "values.estimator": "iql"}))
+    with pytest.raises(UserError, match=r"rlpd has no skills.*horizon must stay 1, not 5"):
+        configs.check_method(load_config("antmaze", "smoke", {**short, "method": "rlpd"}))
+    for other in ({"values.estimator": "graph"}, {"method": "supe"}, {"method": "iql", "skills.horizon": 1}):
+        configs.check_method(load_config("antmaze", "smoke", {**short, **other}))

@@ -9,6 +9,7 @@ import pytest
 
 import envs
 from qdos_brax.commands.main import main
+from qdos_brax.config import load_config, replace
 from qdos_brax.data import checks, formats
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
@@ -16,6 +17,7 @@ from qdos_brax.errors import UserError
 pytestmark = pytest.mark.quick
 
 TASK = "antmaze-medium-task1"
+CONFIG = load_config(TASK, "smoke")
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +44,15 @@ def walk() -> Rows:
 
 
 def findings(rows: Rows, env: envs.Task, made_for: str | None = None) -> checks.Findings:
-    return checks.inspect(rows, env, 20, {} if made_for is None else {"env": made_for})
+    return checks.inspect(rows, env, CONFIG, {} if made_for is None else {"env": made_for}, "the walk")
 
 
 def test_a_good_set_has_no_errors(env: envs.Task) -> None:
     found = findings(walk(), env)
-    assert found.errors == [] and found.notes == ["no row is at the task's goal: no reward to learn from"]
+    assert found.errors == [] and found.notes == [
+        "actions are the same in every row",
+        "no row is at the task's goal: no reward to learn from",
+    ]
 
 
 def _set(array: np.ndarray | None, index: object, value: float) -> None:
@@ -91,22 +96,64 @@ def test_rewards_are_compared_with_the_task(env: envs.Task) -> None:
     for right in (-np.ones(120, np.float32), np.zeros(120, np.float32)):
         rows.rewards = right
         found = findings(rows, env, TASK)
-        assert found.errors == [] and len(found.notes) == 1
+        assert found.errors == [] and len(found.notes) == 2
     rows.rewards = -np.ones(120, np.float32)
     rows.rewards[4:6] = 0.0
     assert findings(rows, env, TASK).errors == [
         f"rewards disagree with {TASK}, which they were made for, in 2 rows (first 4)"
     ]
     found = findings(rows, env, "antmaze-medium-task2")
-    assert found.errors == [] and "rewards of another task or goal in 2 rows (first 4)" in found.notes[1]
+    assert found.errors == [] and "rewards of another task or goal in 2 rows (first 4)" in found.notes[2]
+
+
+def test_what_training_needs_hides_no_other_fault(env: envs.Task) -> None:
+    rows = walk()
+    _set(rows.next_observations, (50, 20), 1.0)
+    rows.qvel = None
+    (needed, order) = findings(rows, env).errors
+    assert "no qvel" in needed and "not the row that follows in 1 row (first 50)" in order
+
+
+def test_what_never_changes_is_said(env: envs.Task) -> None:
+    rows = walk()
+    assert rows.qpos is not None
+    at_goal = env.goal_xy  # type: ignore[attr-defined]
+    for array in (rows.observations, rows.next_observations, rows.qpos):
+        array[:, :2] = at_goal
+    found = findings(rows, env)
+    assert (
+        len(found.errors) == 1 and "estimator=iql" in found.errors[0]
+    )  # by the graph no state can be told from another
+    iql = replace(CONFIG, **{"values.estimator": "iql"})
+    assert checks.inspect(rows, env, iql, {}, "the walk").notes == [
+        "observations are the same in every row",
+        "actions are the same in every row",
+        "every row is at the task's goal: no reward to learn from",
+    ]
+    rows = walk()
+    rows.rewards, rows.qpos, rows.qvel = np.zeros(120, np.float32), None, None
+    logged = replace(CONFIG, **{"skills.mi_rollout": "logged"})
+    assert "every reward is -1: no reward to learn from" in checks.inspect(rows, env, logged, {}, "the walk").notes
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_row_is_enough_for_single_transitions(env: envs.Task, count: int) -> None:
+    rows = walk()
+    rows.drop(np.arange(120) >= count)
+    config = load_config(TASK, "smoke", {"method": "rlpd"})
+    found = checks.inspect(rows, env, config, {}, "the walk")
+    assert found.errors == [] and found.dataset is not None and found.dataset.size == count
+    assert len(findings(rows, env).errors) == 1
 
 
 def test_lengths_are_compared_with_horizon_and_cap(env: envs.Task) -> None:
-    ends = np.zeros(12, bool)
-    ends[[2, 11]] = True
-    assert checks.horizon_lines(ends, 5) == ([], ["1 of 2 episodes are shorter than 5 steps and give no segment"])
-    errors, _ = checks.horizon_lines(ends, 10)
-    assert "no episode has 10 steps (longest 9)" in errors[0]
+    some = walk()
+    some.ends[9] = True
+    assert "1 of 4 episodes are shorter than 20 steps and give no segment" in findings(some, env).notes
+    some.ends[19::20] = True
+    some.ends[12::20] = True
+    (line,) = findings(some, env).errors
+    assert "no episode has 20 steps, the length of a segment (longest 13)" in line
     long = walk()
     parts = {key: np.tile(value, (9, *[1] * (value.ndim - 1))) for key, value in long.arrays().items()}
     parts["ends"][:-1] = False

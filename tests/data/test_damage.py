@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import envs
+from qdos_brax.config import load_config
 from qdos_brax.data import checks, formats
-from qdos_brax.data.labelling import label
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
 
@@ -23,6 +23,7 @@ FILES = Path(__file__).parent / "files"
 FORMATS = ("npz", "npz-plain", "ours", "d4rl", "minari-flat", "minari-dict")
 GUARDED = ("npz", "npz-plain", "ours")  # by checksums over everything that is read; D4RL's and Minari's are not
 TASK = "antmaze-medium-task1"
+CONFIG = load_config(TASK, "smoke", {"skills.horizon": 5, "skills.mi_rollout": "logged"})
 
 
 @pytest.fixture(scope="module")
@@ -68,11 +69,8 @@ def outcome(path: Path, env: envs.Task) -> Rows | None:
     """What comes of a file on the way to training and through ``data check``; None where it is refused."""
     try:
         rows = formats.load(path)
-        found = checks.inspect(rows, env, 5, formats.read_attrs(path))
-        if found.errors:
-            return None
-        label(rows, env, str(path))
-        return rows
+        found = checks.inspect(rows, env, CONFIG, formats.read_attrs(path), str(path))
+        return None if found.errors else rows
     except UserError as error:
         assert "\n" not in str(error) and str(path) in str(error)
         return None

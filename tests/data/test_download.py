@@ -319,4 +319,4 @@ def test_commands_take_names(
     assert "no such file, nor a public data set" in capsys.readouterr().err
     # The name is resolved and the file read: its episodes are too short for a skill.
     assert train_main([*flags, "--dataset", NAME]) == 2
-    assert "no episode of" in capsys.readouterr().err
+    assert "no episode has" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from qdos_brax.data import formats
 from qdos_brax.data.labelling import label
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.errors import UserError
+from tests.data.d4rl_files import d4rl_antmaze, write_d4rl
 
 pytestmark = pytest.mark.quick
 
@@ -188,39 +189,6 @@ def test_damaged_minari_is_refused(tmp_path: Path) -> None:
 # --- D4RL ---
 
 
-def write_d4rl(path: Path, columns: Mapping[str, np.ndarray]) -> Path:
-    """As D4RL's generators do: flat keys, gzip, no next observations."""
-    with h5py.File(path, "w") as file:
-        for key, value in columns.items():
-            file.create_dataset(key, data=value, compression="gzip")
-    return path
-
-
-def d4rl_antmaze(lengths: tuple[int, ...] = (9, 7, 8)) -> dict[str, np.ndarray]:
-    """What D4RL's generator stores: ``infos`` after the action, the last row's next state lost, far resets.
-
-    The body walks 0.2 per step from a start of its own; every other number of the state counts up.
-    """
-    states = []
-    for episode, length in enumerate(lengths):
-        state = np.arange((length + 1) * 29, dtype=np.float32).reshape(length + 1, 29) / 1000
-        state[:, 0], state[:, 1] = 0.2 * np.arange(length + 1), 8.0 * episode
-        states.append(state)
-    before, after = np.concatenate([s[:-1] for s in states]), np.concatenate([s[1:] for s in states])
-    timeouts = np.zeros(len(before), bool)
-    timeouts[np.cumsum(lengths) - 1] = True
-    return {
-        "observations": before,
-        "actions": np.linspace(-1, 1, before.shape[0] * 8, dtype=np.float32).reshape(-1, 8),
-        "rewards": np.zeros(len(before), np.float32),
-        "terminals": np.zeros(len(before), bool),
-        "timeouts": timeouts,
-        "infos/goal": np.full((len(before), 2), 5.0, np.float32),
-        "infos/qpos": after[:, :15],
-        "infos/qvel": after[:, 15:],
-    }
-
-
 KEPT = np.delete(np.arange(24), [8, 15, 23])  # all but the last row of each episode
 
 
@@ -301,30 +269,3 @@ def test_files_with_hardly_any_rows_are_read(tmp_path: Path, count: int, followi
         columns["next_observations"] = np.zeros((count, 29))
     rows = formats.load(write_d4rl(tmp_path / "few.hdf5", columns))
     assert rows.size == (count if following else 0)
-
-
-@pytest.mark.parametrize("states", [False, True])
-def test_d4rl_terminal_last_rows_are_kept_where_the_task_ends(tmp_path: Path, states: bool) -> None:
-    """The file marks each episode's end; with states the task decides, and here no state is at its goal."""
-    columns = d4rl_antmaze()
-    columns["terminals"] = columns.pop("timeouts")
-    columns["rewards"][columns["terminals"]] = 1.0
-    if not states:
-        del columns["infos/qpos"], columns["infos/qvel"]
-    env = envs.make("antmaze-medium")
-    rows = formats.load(write_d4rl(tmp_path / "a.hdf5", columns), env.jump)
-    np.testing.assert_array_equal(np.flatnonzero(rows.terminals), [8, 15, 23])
-    labelled = label(rows, env, "a")
-    kept = KEPT if states else np.arange(24)
-    np.testing.assert_array_equal(labelled.observations, columns["observations"][kept])
-    np.testing.assert_array_equal(np.flatnonzero(labelled.ends), [7, 13, 20] if states else [8, 15, 23])
-    np.testing.assert_array_equal(labelled.masks == 0, np.zeros(21, bool) if states else columns["terminals"])
-    assert f"{0 if states else 3} are kept and {3 if states else 0} dropped" in rows.notes[-1]
-
-
-def test_rounded_next_observations_are_named(tmp_path: Path) -> None:
-    columns = d4rl_antmaze()
-    following = np.concatenate([columns["infos/qpos"], columns["infos/qvel"]], axis=1)
-    columns["next_observations"] = following.astype(np.float16)
-    with pytest.raises(UserError, match=r"next_observations do not match .*by up to \S+ in a typical one"):
-        formats.load(write_d4rl(tmp_path / "a.hdf5", columns))

@@ -49,7 +49,7 @@ def phases() -> dict[str, Any]:
     config = configs.replace(point_config(**SMALL), seed=SEEDS)
     data, normaliser = to_device(point_dataset(episodes=40), config.skills.horizon)
     model = SkillModel(2, 2, SIZES)
-    information = PhysicsRollout(PointEnv(), model, normaliser, config.skills.horizon, data)
+    information = PhysicsRollout(PointEnv(), model, normaliser, config.skills.horizon)
     low_level = TrajectorySkills(model, "box")
     policy = BC(2, 2, configs.PolicyConfig(hidden=(16,), batch_size=16))
     online = OnlinePhase(config, PointEnv(), normaliser, low_level, DataReward(), NoBonus(), steps_per_chunk=100)
@@ -135,7 +135,7 @@ def breaking() -> tuple[SkillPhase, dict[str, jax.Array]]:
     config = configs.replace(point_config(**SMALL, **{"skills.alpha": 1.0}), seed=SEEDS)
     data, normaliser = to_device(point_dataset(episodes=40), config.skills.horizon)
     model = SkillModel(2, 2, SIZES)
-    information = PhysicsRollout(BreakingEnv(), model, normaliser, config.skills.horizon, data)
+    information = PhysicsRollout(BreakingEnv(), model, normaliser, config.skills.horizon)
     phase = bound(SkillPhase(config, model, LoggedWeights(), information, blocks_per_chunk=1), config, data)
     return phase, {"advantage": jnp.zeros((3, data.starts.shape[0]))}
 

@@ -41,7 +41,7 @@ def rollouts(env: envs.Task, qpos: np.ndarray, qvel: np.ndarray, latent: np.ndar
         qvel=qvel,
     )
     data, _ = to_device(dataset, HORIZON)
-    rollout = PhysicsRollout(env, constant_skills(env.action_size), lambda observation: observation, HORIZON, data)
+    rollout = PhysicsRollout(env, constant_skills(env.action_size), lambda observation: observation, HORIZON)
     return np.asarray(jax.jit(lambda data, latent: rollout({}, data, data.starts, latent))(data, latent))
 
 

@@ -66,7 +66,7 @@ def train_skills(config, weights=None, information=True, artifacts=None, chunks=
     model = make_model(config, env)
     source = None
     if information:
-        source = PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
+        source = PhysicsRollout(env, model, normaliser, config.skills.horizon)
         if config.skills.mi_rollout == "logged":
             source = LoggedStates(config.skills.horizon)
     phase = bound(SkillPhase(config, model, weights or UniformWeights(), source), config, data)
@@ -82,7 +82,7 @@ def decodability(env, model, normaliser, params, config):
     data, _ = to_device(point_dataset(seed=7), config.skills.horizon)
     rollout = LoggedStates(config.skills.horizon)
     if config.skills.mi_rollout == "physics":
-        rollout = PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
+        rollout = PhysicsRollout(env, model, normaliser, config.skills.horizon)
     keys = jax.random.split(jax.random.key(5), 2)
     starts = data.starts[jax.random.randint(keys[0], (256,), 0, data.starts.shape[0])]
     latent = jax.random.uniform(keys[1], (256, config.skills.latent_dim), minval=-2, maxval=2)
@@ -176,7 +176,7 @@ def test_chunks_are_not_traced_again_and_members_differ_by_seed_and_value():
     env = PointEnv()
     data, normaliser = to_device(point_dataset(), config.skills.horizon)
     model = make_model(config, env)
-    source = PhysicsRollout(env, model, normaliser, config.skills.horizon, data)
+    source = PhysicsRollout(env, model, normaliser, config.skills.horizon)
     phase = bound(SkillPhase(config, model, UniformWeights(), source, blocks_per_chunk=2), config, data)
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
     state, constants = phase.init(jax.vmap(jax.random.key)(seeds), {})

@@ -9,7 +9,6 @@ import numpy as np
 
 from qdos_brax.data.readers.rows import Rows, after_action, unreadable
 from qdos_brax.data.readers.table import DataTable, HDF5Table
-from qdos_brax.errors import UserError
 
 _OPTIONAL = ("next_observations", "rewards", "timeouts", "infos/qpos", "infos/qvel", "infos/extra", "infos/quality")
 
@@ -53,18 +52,19 @@ def load(path: Path, jump: float | None) -> Rows:
         terminals = table.column("terminals") != 0
         marked = table.column("timeouts") != 0 if "timeouts" in table else terminals.copy()
         notes: list[str] = []
-        keep = None
+        keep, mismatch = None, ""
         (observations,) = table.floats("observations", None)
         if "next_observations" in table:
             (following,) = table.floats("next_observations", None)
             breaks = _breaks(observations, following)
-            _require_same_precision(path, observations, following, breaks)
+            mismatch = _mismatch(observations, following, breaks)
         else:
             breaks = _jumps(observations, jump if "infos/qpos" in table else None)
         ends = marked | breaks
         if len(ends):
             ends[-1] = True
-            _note_breaks(notes, marked, breaks)
+            if not mismatch:
+                _note_breaks(notes, marked, breaks)
         if "next_observations" not in table:
             # A last row without a next state is of use where the task terminates in it: labelling decides.
             last_kept = ends & terminals
@@ -73,7 +73,7 @@ def load(path: Path, jump: float | None) -> Rows:
             unknown = last_kept[keep]
             ends = (ends | np.roll(ends & ~last_kept, -1))[keep]
             observations = observations[keep]
-        rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes)
+        rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes, mismatch=mismatch)
         rows.unknown_next = None if keep is None else unknown
         rows.terminals = terminals.astype(np.float32) if keep is None else terminals[keep].astype(np.float32)
         for key in ("qpos", "qvel"):
@@ -103,18 +103,19 @@ def _breaks(observations: np.ndarray, following: np.ndarray) -> np.ndarray:
     return breaks
 
 
-def _require_same_precision(path: Path, observations: np.ndarray, following: np.ndarray, breaks: np.ndarray) -> None:
-    """Raise UserError where most next observations are nearly, not exactly, the next row's: they were rounded."""
+def _mismatch(observations: np.ndarray, following: np.ndarray, breaks: np.ndarray) -> str:
+    """Return a line where most next observations are nearly, not exactly, the next row's: they were rounded."""
     if len(breaks) < 2 or breaks.mean() <= 0.5:
-        return
+        return ""
     apart = np.abs(observations[1:] - following[:-1])[breaks[:-1]]
     limit = 2.0**-10 * np.abs(observations[1:])[breaks[:-1]] + 1e-6  # float16 rounds to within half of it
-    if (apart <= limit).reshape(len(apart), -1).all(axis=1).mean() > 0.5:
-        raise UserError(
-            f"{path}: next_observations do not match the next row's observations in {breaks.sum()} of {len(breaks)} "
-            f"rows, by up to {np.median(apart.reshape(len(apart), -1).max(axis=1)):.2g} in a typical one: rounded to "
-            "another precision? store both alike, or leave next_observations out"
-        )
+    if (apart <= limit).reshape(len(apart), -1).all(axis=1).mean() <= 0.5:
+        return ""
+    return (
+        f"next_observations do not match the next row's observations in {breaks.sum()} of {len(breaks)} rows, by up "
+        f"to {np.median(apart.reshape(len(apart), -1).max(axis=1)):.2g} in a typical one, so that each of these rows "
+        "ends an episode: rounded to another precision? store both alike, or leave next_observations out"
+    )
 
 
 def _jumps(observations: np.ndarray, jump: float | None) -> np.ndarray:

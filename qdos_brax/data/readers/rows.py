@@ -34,6 +34,8 @@ class Rows:
         unknown_next: bool[N], rows whose next observation is not in the file (their own is repeated), or None.
         quality: int8[N], what produced the step, or None.
         notes: what the reader had to correct or leave out, one line each.
+        mismatch: how next observations miss the rows that follow, so that most rows count as ends of episodes, in one
+            line; "" where they do not.
     """
 
     observations: np.ndarray
@@ -48,6 +50,7 @@ class Rows:
     quality: np.ndarray | None = None
     unknown_next: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+    mismatch: str = ""
 
     @property
     def size(self) -> int:

@@ -1,0 +1,96 @@
+"""What a configuration's training needs of the data; ``data check`` and every training ask here, so that they agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from envs.task import Task
+from qdos_brax.config import Config
+from qdos_brax.config.methods import METHODS
+from qdos_brax.data.dataset import Dataset, episode_bounds
+from qdos_brax.data.readers.rows import Rows
+from qdos_brax.data.segments import segment_starts
+from qdos_brax.errors import UserError
+
+_BLOCK = 1 << 14  # segments compared at once
+_SAME = 1e-30  # observations that differ by less are equal on a device, which flushes smaller numbers to 0
+
+
+def unmet(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
+    """Return one line for each need of ``config`` that ``data`` does not meet, with the setting that helps.
+
+    Args:
+        data: transitions of the task, of its sizes and finite.
+        env: the task.
+        config: the configuration to train with.
+    """
+    return [*_segments(data, config), *_states(data, env, config), *_observations(data, config)]
+
+
+def remarks(data: Rows | Dataset, config: Config) -> list[str]:
+    """Return one line for each thing that training says of ``data`` and does without."""
+    return [*data.notes, *([data.mismatch] if data.mismatch and config.skills.horizon == 1 else [])]
+
+
+def refuse(source: str, lines: Sequence[str]) -> None:
+    """Raise UserError with the first of ``lines``, if there are any; ``source`` is where the data came from."""
+    if lines:
+        more = f" (and {len(lines) - 1} more, see: data check)" if len(lines) > 1 else ""
+        raise UserError(f"{source}: {lines[0]}{more}")
+
+
+def _segments(data: Rows | Dataset, config: Config) -> list[str]:
+    """Return a line if no segment lies within one episode."""
+    horizon = config.skills.horizon
+    longest = int(np.diff(episode_bounds(data.ends), axis=1).max(initial=0))
+    if data.mismatch and horizon > 1:
+        return [data.mismatch]
+    if longest >= horizon:
+        return []
+    order = ""
+    if data.ends.mean() > 0.5 and data.observations.shape == data.next_observations.shape:
+        apart = (data.next_observations[:-1] != data.observations[1:]).reshape(len(data.ends) - 1, -1).any(axis=1)
+        order = f"; next_observations are not the next row's observations in {apart.sum()} of {len(data.ends)} rows"
+    return [
+        f"no episode has {horizon} steps, the length of a segment (longest {longest}){order}: use --set "
+        "skills.horizon=N with a smaller N"
+    ]
+
+
+def _states(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
+    """Return a line if rollouts in the simulator have no states to start from."""
+    if not METHODS[config.method].information or config.skills.mi_rollout != "physics":
+        return []
+    needed = {"qpos": data.qpos, "qvel": data.qvel} | ({"infos/extra": data.extra} if env.extra_size else {})
+    missing = [name for name, array in needed.items() if array is None]
+    if not missing:
+        return []
+    return [
+        f"no {' and '.join(missing)}, the simulator states from which {config.method} rolls out its skills: use "
+        "--set skills.mi_rollout=logged"
+    ]
+
+
+def _observations(data: Rows | Dataset, config: Config) -> list[str]:
+    """Return a line if the graph of states cannot tell one state from another."""
+    if not METHODS[config.method].weighted or config.values.estimator != "graph" or not _constant(data, config):
+        return []
+    return [
+        "observations are the same in every row, so that values.estimator=graph cannot tell states apart: use "
+        "--set values.estimator=iql, or a file whose observations change"
+    ]
+
+
+def _constant(data: Rows | Dataset, config: Config) -> bool:
+    """Return whether all segments begin and end with the same observation."""
+    if data.observations.shape != data.next_observations.shape:  # another fault, which the checks name
+        return False
+    starts, last = segment_starts(data.ends, config.skills.horizon), config.skills.horizon - 1
+    for begin in range(0, len(starts), _BLOCK):
+        some = starts[begin : begin + _BLOCK]
+        for part in (data.observations[some], data.next_observations[some + last]):
+            if (np.abs(part - data.observations[starts[0]]) > _SAME).any():
+                return False
+    return len(starts) > 0
