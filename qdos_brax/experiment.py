@@ -21,7 +21,7 @@ from qdos_brax.analysis.finished import trained_run
 from qdos_brax.collection.default_set import default_dataset
 from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
-from qdos_brax.data import download, formats
+from qdos_brax.data import download, formats, relocation
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.requirements import remarks
 from qdos_brax.errors import UserError
@@ -33,6 +33,7 @@ from qdos_brax.runs import comparison, observers, shares, signals
 from qdos_brax.runs.checkpoint import Artifacts
 from qdos_brax.runs.fingerprints import sha256
 from qdos_brax.runs.folder import RunFolder, new_path
+from qdos_brax.runs.hints import resume_command, resume_flag
 from qdos_brax.runs.hosts import ALONE, Hosts
 from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.runs.loop import run_phases
@@ -112,13 +113,21 @@ def _start_run(asked: Config, env: Any, started: float, hosts: Hosts, chosen: bo
         _run(config, folder, started, hosts)
 
 
-def resume(path: str, started: float, hosts: Hosts = ALONE) -> None:
+def resume(path: str, started: float, hosts: Hosts = ALONE, dataset: str | None = None) -> None:
     """Continue the run or the comparison in ``path`` to its end.
 
+    Args:
+        path: its folder.
+        started: ``time.perf_counter()`` at the process's start.
+        hosts: the processes that share the run.
+        dataset: where its data has moved to.
+
     Raises:
-        UserError: there is none, another process works on it, or it cannot continue.
+        UserError: there is none, another process works on it, it began with other data, or it cannot continue.
     """
     prepare_jax()
+    if dataset is not None:
+        relocation.relocate(path, dataset)
     if comparison.is_comparison(path):
         _compare(Path(path), started, chosen=False)
     else:
@@ -132,7 +141,7 @@ def check_new(path: str) -> None:
         UserError: there is something at ``path``.
     """
     if Path(path).exists() and any(Path(path).iterdir()):
-        raise UserError(f"{path} is not empty; continue with --resume {path}, or choose another --out")
+        raise UserError(f"{path} is not empty; continue with {resume_flag(path)}, or choose another --out")
 
 
 def _compare(path: Path, started: float, chosen: bool) -> None:
@@ -144,9 +153,9 @@ def _compare(path: Path, started: float, chosen: bool) -> None:
             try:
                 _continue(folder, started, chosen)
             except UserError as error:
-                raise UserError(f"{name}: {error} (then: python train.py --resume {path})") from error
+                raise UserError(f"{name}: {error} (then: {resume_command(path)})") from error
             except SystemExit:  # a signal; the run was saved and its own --resume printed
-                print(f"for the whole comparison: python train.py --resume {path}", file=sys.stderr, flush=True)
+                print(f"for the whole comparison: {resume_command(path)}", file=sys.stderr, flush=True)
                 raise
             jax.clear_caches()  # the next run's programs are others
             started = time.perf_counter()
@@ -168,15 +177,17 @@ def _continue(folder: RunFolder, started: float, chosen: bool, hosts: Hosts = AL
             conclude(folder, summary, lambda: read_finished(folder))
             return
         observers.check(config.run)
+        relocation.check_data(folder, config)
         _announce(config, config, chosen)
         _run(config, folder, started, hosts)
 
 
 def _resolved(asked: Config, env: Any, path: Path) -> Config:
-    """Return the configuration with the full name of the task, the engine that was chosen, and the folder."""
+    """Return the configuration with the task's full name, the engine that was chosen, the folder, and lasting paths."""
     # Without the term alpha has no effect: a scan over it would train the same member again and again.
     alpha = {} if METHODS[asked.method].information else {"skills.alpha": 0.0}
-    return configs.replace(asked, env=env.spec.full_name, physics=env.backend, out=str(path), **alpha)
+    dataset = {"dataset": download.lasting_name(asked.dataset)} if asked.dataset else {}
+    return configs.replace(asked, env=env.spec.full_name, physics=env.backend, out=str(path), **dataset, **alpha)
 
 
 def _new_path(config: Config, env: Any, name: str) -> Path:
@@ -288,10 +299,7 @@ def _data_file(config: Config, env: Any) -> tuple[Path, str | None]:
 def _record_origin(folder: RunFolder, data: _Data) -> None:
     """Write run.json: command, data and packages; on resume, refuse other data than at the start."""
     if folder.provenance.exists():
-        try:
-            earlier = str(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["sha256"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UserError(f"{folder.provenance} is damaged ({error!r}); restore it, or start a new run") from error
+        earlier = folder.read_origin()["dataset"]["sha256"]
         if earlier != data.sha256:
             raise UserError(
                 f"{data.path} is not the file that the run began with "
@@ -300,7 +308,7 @@ def _record_origin(folder: RunFolder, data: _Data) -> None:
         return
     content = {
         "command": sys.argv,
-        "dataset": {"path": str(data.path), "sha256": data.sha256},
+        "dataset": {"path": str(data.path.absolute()), "sha256": data.sha256},
         "python": platform.python_version(),
         "packages": {name: metadata.version(name) for name in _PACKAGES},
     }

@@ -25,6 +25,7 @@ import argparse
 import json
 import math
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -256,7 +257,8 @@ def sweep(
         else:
             ended += 1
         print(f"{metrics.get('trial_id')}: {' '.join(settings(result.config)[1::2])}, {how}")
-    print(f"report    python -m qdos_brax report {out}/trials/* --out {out}/report", flush=True)
+    folder = shlex.quote(str(out))
+    print(f"report    python -m qdos_brax report {folder}/trials/* --out {folder}/report", flush=True)
     return 0 if ended == len(results) else 1
 
 

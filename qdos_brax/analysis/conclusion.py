@@ -15,6 +15,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.errors import UserError
 from qdos_brax.report.write import Report, write_report
 from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.hints import module_command
 
 
 def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[], tuple[TrainedRun, Dataset]]) -> None:
@@ -38,7 +39,7 @@ def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[
         print(f"  {with_alpha(summary['method'], member['alpha'])}seed {member['seed']}: {_result(member)}")
     print(f"summary   {folder.summary}")
     print_files(report)
-    print(f"evaluate  python -m qdos_brax evaluate {folder.path}", flush=True)
+    print(f"evaluate  {module_command('evaluate', folder.path)}", flush=True)
 
 
 def _result(member: Mapping[str, Any]) -> str:

@@ -24,6 +24,7 @@ from qdos_brax.offline.flat_policy import FlatPolicy
 from qdos_brax.population.members import Population
 from qdos_brax.runs.checkpoint import final_artifacts
 from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.hints import resume_command
 
 
 class TrainedRun(NamedTuple):
@@ -56,7 +57,7 @@ def load_run(run: Path) -> TrainedRun:
     folder = RunFolder.open(str(run))
     config = configs.from_yaml(folder.config)
     if folder.read_summary() is None:
-        raise UserError(f"the run in {run} has not finished; continue it with: python train.py --resume {run}")
+        raise UserError(f"the run in {run} has not finished; continue it with: {resume_command(run)}")
     env = envs.make(config.env, physics=config.physics)
     return trained_run(config, env, final_artifacts(folder.checkpoints, configs.config_hash(config)))
 

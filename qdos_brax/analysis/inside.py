@@ -176,7 +176,8 @@ class _LatentView:
 
     def _path(self, artifacts: Any, hyper: Any, latent: jax.Array) -> jax.Array:
         """Return float[T + 1, 2], the positions from the start on while one latent is begun again and again."""
-        env, agent = self._trained.env, self._trained.agent(artifacts, hyper)
+        env = self._trained.env
+        agent: Any = self._trained.agent(artifacts, hyper)  # of both levels, where there are skills
         horizon = self._trained.config.skills.horizon
 
         def step(carry: tuple[Any, jax.Array], t: jax.Array) -> tuple[Any, jax.Array]:

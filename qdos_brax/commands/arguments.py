@@ -61,7 +61,9 @@ def natural(text: str) -> int:
 def guarded(work: Callable[[], int | None]) -> int:
     """Return the exit code of ``work``; for a UserError print one line and return 2."""
     try:
-        return work() or 0
+        code = work() or 0
+        sys.stdout.flush()
+        return code
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""The commands of ``python -m qdos_brax``: data, evaluate, report, picture, tasks, doctor."""
+"""The commands of ``python -m qdos_brax``: train, data, evaluate, report, picture, tasks, doctor."""
 
 from __future__ import annotations
 
@@ -11,23 +11,31 @@ from pathlib import Path
 from qdos_brax import __version__
 from qdos_brax.commands.arguments import Parser, guarded, parse, positive
 from qdos_brax.commands.config import add_parser as add_config
+from qdos_brax.commands.streams import lasting_streams
+from qdos_brax.commands.train import train_main
 from qdos_brax.errors import UserError
+
+_PROGRAM = "python -m qdos_brax"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``python -m qdos_brax``; return the exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
-    args = parse(main_parser(argv), argv)
-    return guarded(lambda: args.run(args))
+    if argv[:1] == ["train"]:
+        return train_main(argv[1:], prog=f"{_PROGRAM} train")
+    with lasting_streams():
+        args = parse(main_parser(argv), argv)
+        return guarded(lambda: args.run(args))
 
 
 def main_parser(argv: Sequence[str]) -> Parser:
     """Return the parser of ``python -m qdos_brax``; the actions of ``data`` only if ``argv`` asks for them."""
     parser = Parser(
-        prog="python -m qdos_brax", description="Data, evaluation, reports, pictures, a check of this machine."
+        prog=_PROGRAM, description="Training, data, evaluation, reports, pictures, a check of this machine."
     )
     parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    commands.add_parser("train", help="train, as train.py does")
     if argv[:1] == ["data"]:
         from qdos_brax.commands.data import add_parser  # imports jax and h5py, which the others need not wait for
 

@@ -10,23 +10,25 @@ from functools import partial
 
 from qdos_brax import __version__
 from qdos_brax.commands.arguments import Parser, guarded, natural, parse, positive
+from qdos_brax.commands.streams import lasting_streams
 from qdos_brax.config import Config, load_programs, presets
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.schema import get_field, labelled, pretrain_keys
 from qdos_brax.errors import UserError
 
 
-def train_main(argv: Sequence[str] | None = None) -> int:
-    """Run ``python train.py``; return the exit code."""
+def train_main(argv: Sequence[str] | None = None, prog: str = "python train.py") -> int:
+    """Run ``python train.py``, or the same under another name; return the exit code."""
     started = time.perf_counter()
-    args = parse(train_parser(), sys.argv[1:] if argv is None else argv)
-    return guarded(lambda: _train(args, started))
+    with lasting_streams():
+        args = parse(train_parser(prog), sys.argv[1:] if argv is None else argv)
+        return guarded(lambda: _train(args, started))
 
 
-def train_parser() -> Parser:
+def train_parser(prog: str = "python train.py") -> Parser:
     """Return the parser of ``train.py``."""
     parser = Parser(
-        prog="python train.py",
+        prog=prog,
         description="Collect or read data, pretrain skills, label the data, learn online, evaluate and report.",
         epilog="Any key of config.yaml can be set with --set; python -m qdos_brax config lists and explains the keys.",
     )
@@ -50,7 +52,8 @@ def train_parser() -> Parser:
     parser.add_argument(
         "--resume",
         metavar="DIR",
-        help="continue the run or comparison in DIR exactly where it stopped; takes no other flag",
+        help="continue the run or comparison in DIR exactly where it stopped; takes no other flag but --dataset, which "
+        "names the same data in a new place",
     )
     parser.add_argument(
         "--dataset",
@@ -137,9 +140,11 @@ def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:
 
 def _train(args: argparse.Namespace, started: float) -> int:
     connection = ("distributed", "coordinator", "processes", "process_id")
-    given = [name for name, value in vars(args).items() if name not in ("resume", *connection) and value]
+    given = [name for name, value in vars(args).items() if name not in ("resume", "dataset", *connection) and value]
     if args.resume is not None and given:
         raise UserError(f"--resume uses the run's own config.yaml; leave out --{given[0].replace('_', '-')}")
+    if args.resume is not None and args.dataset is not None and args.distributed:
+        raise UserError("--resume with --dataset notes where the data is now; do that once without --distributed")
     if args.resume is None and args.env is None:
         raise UserError("give a task with --env (python -m qdos_brax tasks lists them), or a run to --resume")
 
@@ -162,5 +167,5 @@ def _train(args: argparse.Namespace, started: float) -> int:
         asked = partial(configs_from_args, args)
         experiment.start(asked, preset_given=args.preset is not None, started=started, hosts=hosts)
     else:
-        experiment.resume(args.resume, started=started, hosts=hosts)
+        experiment.resume(args.resume, started=started, hosts=hosts, dataset=args.dataset)
     return 0

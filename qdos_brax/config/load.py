@@ -125,13 +125,16 @@ def config_hash(config: Config) -> str:
     """Return 16 hex digits over everything that decides the result, which neither folders nor the ``run`` group do.
 
     Values without effect are left out too, so that runs from before such a key existed can be read: the scan group if
-    it has its defaults, and the members per program if there is one member or no number was given.
+    it has its defaults, the view of skills if it is the world's, and the members per program if there is one member or
+    no number was given.
     """
     content = plain(config)
     for key in ("out", "dataset", "run"):
         del content[key]
     if config.scan == Config().scan:
         del content["scan"]
+    if config.skills.view == "world":
+        del content["skills"]["view"]
     if config.members_per_program == 0 or len(scan.members(config)) == 1:
         del content["members_per_program"]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

@@ -25,7 +25,7 @@ def locked(path: Path) -> Iterator[None]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = open(path.with_suffix(".lock"), "w")  # noqa: SIM115 (closed below)
+        lock = open(path.with_suffix(".lock"), "wb")  # noqa: SIM115 (closed below)
     except OSError as error:
         raise UserError(
             f"{path.parent} cannot be written ({error.strerror}); set QDOS_DATA to another folder"

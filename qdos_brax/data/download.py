@@ -72,6 +72,12 @@ def check(name: str) -> None:
         raise UserError(f"{name}: no such file, nor a public data set such as {sources.examples()}")
 
 
+def lasting_name(name: str) -> str:
+    """Return the name by which a data set is found from any folder: a file's absolute path, a public set's name."""
+    path = Path(name).expanduser()
+    return str(path.absolute()) if path.exists() else name
+
+
 def resolve(name: str) -> DataFile:
     """Return the file of a data set: ``name`` itself if that exists, else the public set of that name.
 

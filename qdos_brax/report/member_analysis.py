@@ -11,6 +11,7 @@ import numpy as np
 from qdos_brax.errors import UserError
 from qdos_brax.report.study import Member, Run, Study
 from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.hints import resume_flag
 
 # By quality code. Collected data have four codes, 0 for good behaviour; other data may have more.
 QUALITY_COLOURS = ("#009E73", "#56B4E9", "#E69F00", "#D55E00", "#CC79A7", "#0072B2")
@@ -93,7 +94,9 @@ def _read_run(study: Study, run: Run) -> list[MemberAnalysis]:
             arrays = {name: content[name] for name in content.files}
         members = {int(index): run.members[int(index)] for index in arrays["members"]}
     except (OSError, EOFError, LookupError, ValueError, zipfile.BadZipFile) as error:
-        raise UserError(f"cannot read {file} ({error}); delete it, and --resume {run.path} creates it again") from error
+        raise UserError(
+            f"cannot read {file} ({error}); delete it, and {resume_flag(run.path)} creates it again"
+        ) from error
     shared = {name: array for name, array in arrays.items() if "/" not in name}
     return [
         MemberAnalysis(member, _label(study, member), shared, _of_member(arrays, index))

@@ -15,6 +15,7 @@ from qdos_brax.config.schema import get, leaves
 from qdos_brax.errors import UserError
 from qdos_brax.runs import comparison
 from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.hints import resume_command, resume_flag
 from qdos_brax.runs.metrics import Row, read_rows
 
 DATA = "data"  # the key under which a setting holds the data file's hash
@@ -156,9 +157,7 @@ def _read_run(folder: RunFolder) -> Run:
     config = from_yaml(folder.config)
     summary = folder.read_summary()
     if summary is None:
-        raise UserError(
-            f"the run in {folder.path} has not finished; continue it with: python train.py --resume {folder.path}"
-        )
+        raise UserError(f"the run in {folder.path} has not finished; continue it with: {resume_command(folder.path)}")
     rows = read_rows(folder.metrics)
     if not rows:
         raise UserError(f"{folder.metrics} has no rows, so there is nothing to report; leave this run out")
@@ -174,7 +173,7 @@ def _read_run(folder: RunFolder) -> Run:
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"{folder.summary} does not match {folder.metrics.name} or is damaged ({error!r}); delete it, and "
-            f"--resume {folder.path} writes it again"
+            f"{resume_flag(folder.path)} writes it again"
         ) from error
     return Run(folder.path, config, provenance, summary, members)
 

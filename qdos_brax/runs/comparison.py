@@ -9,6 +9,7 @@ from pathlib import Path
 from qdos_brax.errors import UserError
 from qdos_brax.files import replacing_folder, user_errors, write_text
 from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.hints import resume_flag
 
 _FILE = "comparison.json"
 
@@ -30,7 +31,9 @@ def create(path: Path, configs: Mapping[str, str]) -> None:
     """
     with user_errors(path):
         if is_comparison(path):
-            raise UserError(f"{path} holds a comparison already; continue with --resume {path} or choose another --out")
+            raise UserError(
+                f"{path} holds a comparison already; continue with {resume_flag(path)} or choose another --out"
+            )
         if path.exists() and any(path.iterdir()):
             raise UserError(f"{path} is not empty; choose another --out")
     with replacing_folder(path) as partial:

@@ -13,6 +13,7 @@ from typing import Any
 
 from qdos_brax.errors import UserError
 from qdos_brax.files import is_partial, user_errors
+from qdos_brax.runs.hints import resume_flag
 
 
 class RunFolder:
@@ -51,9 +52,8 @@ class RunFolder:
         folder = cls(path)
         with user_errors(folder.path):
             if folder.metrics.exists():
-                raise UserError(
-                    f"{folder.path} holds a run already; continue with --resume {folder.path} or choose another --out"
-                )
+                how = f"continue with {resume_flag(folder.path)} or choose another --out"
+                raise UserError(f"{folder.path} holds a run already; {how}")
             before_training = {folder.config, folder.provenance, folder.checkpoints, folder.path / ".lock"}
             found = set(folder.path.iterdir()) if folder.path.exists() else set()
             if any(path not in before_training and not is_partial(path) for path in found):
@@ -98,6 +98,20 @@ class RunFolder:
                 return False
         except UserError:
             return True
+
+    def read_origin(self) -> dict[str, Any]:
+        """Return the content of run.json.
+
+        Raises:
+            UserError: the file is damaged.
+        """
+        try:
+            content = dict(json.loads(self.provenance.read_text(encoding="utf-8")))
+            if not isinstance(content["dataset"]["sha256"], str):
+                raise ValueError("dataset.sha256 is no text")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{self.provenance} is damaged ({error!r}); restore it, or start a new run") from error
+        return content
 
     def read_summary(self) -> dict[str, Any] | None:
         """Return the content of summary.json; None if the run has not finished.

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: a run stops where it loses nothing, and prints how to continue it."""
+"""SIGINT, SIGTERM, SIGHUP: a run stops where it loses nothing, and prints how to continue it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 
-_STOPPING = (signal.SIGINT, signal.SIGTERM)
+from qdos_brax.runs.hints import resume_command
+
+_STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 @contextlib.contextmanager
@@ -20,7 +22,8 @@ def collected() -> Iterator[list[int]]:
 
     def handle(number: int, frame: FrameType | None) -> None:
         caught.append(number)
-        signal.signal(number, signal.SIG_DFL)
+        # A session that ends sends more than one SIGHUP: from the shell, and from the terminal itself.
+        signal.signal(number, signal.SIG_IGN if _is_hang_up(number) else signal.SIG_DFL)
         warn("stopping after this chunk; a second signal stops at once")
 
     with _handled_by(handle):
@@ -35,7 +38,7 @@ def stops_at_once(path: Path) -> Iterator[None]:
         path: the run's folder, for the line that tells how to continue it.
 
     Raises:
-        SystemExit: a signal arrived; the code is 130 or 143.
+        SystemExit: a signal arrived; the code is 129, 130 or 143.
     """
     caught: list[int] = []
 
@@ -61,7 +64,7 @@ def stop(number: int, how: str, path: Path) -> None:
         how: first words of the line.
         path: the run's folder.
     """
-    warn(f"{how}; continue with: python train.py --resume {path}")
+    warn(f"{how}; continue with: {resume_command(path)}")
     raise SystemExit(128 + number) from None
 
 
@@ -75,9 +78,19 @@ def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Non
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may handle signals
         return
-    handlers = {number: signal.signal(number, handle) for number in _STOPPING}
+    numbers = [number for number in _STOPPING if not (_is_hang_up(number) and _is_ignored(number))]
+    handlers = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
+
+
+def _is_hang_up(number: int) -> bool:
+    return number == getattr(signal, "SIGHUP", None)
+
+
+def _is_ignored(number: int) -> bool:
+    """Return whether whoever started the program had the signal ignored, as ``nohup`` does."""
+    return signal.getsignal(number) == signal.SIG_IGN

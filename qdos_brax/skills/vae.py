@@ -44,9 +44,7 @@ class SkillModel:
         view: as given.
     """
 
-    def __init__(
-        self, observation_dim: int, action_dim: int, config: SkillsConfig, view: View | None = None
-    ) -> None:
+    def __init__(self, observation_dim: int, action_dim: int, config: SkillsConfig, view: View | None = None) -> None:
         self.latent_dim, self.view = config.latent_dim, view or WorldView()
         self._seen_dim, self._action_dim = self.view.size(observation_dim), action_dim
         self._encoder = SegmentEncoder(config.encoder_hidden, config.encoder_layers, config.latent_dim)

@@ -11,7 +11,7 @@ import pytest
 
 from qdos_brax.errors import UserError
 from qdos_brax.files import is_partial, replacing_folder, write_text
-from qdos_brax.runs import signals
+from qdos_brax.runs import hints, signals
 from qdos_brax.runs.folder import RunFolder, new_path
 
 pytestmark = pytest.mark.quick
@@ -89,7 +89,7 @@ def test_what_a_kill_left_half_written_is_not_in_the_way(tmp_path: Path) -> None
     RunFolder.create(folder.path)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
 def test_a_signal_outside_the_phases_says_how_to_go_on(
     number: int, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -103,3 +103,19 @@ def test_a_signal_outside_the_phases_says_how_to_go_on(
     assert stopped.value.code == code and signal.getsignal(number) is before
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"stopped; continue with: python train.py --resume {tmp_path}"
+
+
+def test_what_nohup_ignores_stays_ignored(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with signals.stops_at_once(tmp_path):
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_hints_are_quoted_for_the_shell() -> None:
+    assert hints.resume_command("my run") == "python train.py --resume 'my run'"
+    assert hints.module_command("evaluate", Path("it's")) == """python -m qdos_brax evaluate 'it'"'"'s'"""
+    assert hints.resume_flag("plain") == "--resume plain"

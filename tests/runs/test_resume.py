@@ -115,14 +115,17 @@ def test_kill_9_resumes_exactly(tmp_path: Path, whole: Path, phase: str, chunks:
     assert_same_end(path, whole)
 
 
-def test_sigterm_saves_and_says_how_to_go_on(tmp_path: Path, whole: Path) -> None:
-    path = tmp_path / "run"
+@pytest.mark.parametrize("numbers", [[signal.SIGTERM], [signal.SIGHUP, signal.SIGHUP]], ids=["term", "hangups"])
+def test_a_signal_saves_and_says_how_to_go_on(tmp_path: Path, whole: Path, numbers: list[signal.Signals]) -> None:
+    """A session that ends hangs up more than once."""
+    path = tmp_path / "my run"
     process = start(path, 0.3)
     wait_for_rows(process, path, 4 * 2)
-    process.terminate()
+    for number in numbers:
+        process.send_signal(number)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 143
-    assert f"--resume {path}" in err
+    assert process.returncode == 128 + numbers[0]
+    assert f"--resume '{path}'" in err
     toy.run(path)
     assert_same_end(path, whole)
 
