@@ -17,7 +17,7 @@ from qdos_brax.data.segments import window
 from qdos_brax.errors import UserError
 
 _SEGMENTS = 4_000  # that the statistics of a view are taken from, about
-_LEAST_SCALE = 1e-3  # of a column that never changes in the frame, such as the place in one's own
+_CONSTANT = 1e-3  # deviation of a column that never changes in the frame, such as the place in one's own
 
 
 class View(Protocol):
@@ -91,7 +91,8 @@ class StartView:
         world = {"mean": normaliser.mean, "scale": normaliser.scale}
         plain = {"world": world, "seen": {"mean": 0.0, "scale": 1.0}}
         seen = self.see(plain, windows, self.pose(plain, windows[:, 0])[:, None])
-        scale = jnp.maximum(jnp.std(seen, axis=(0, 1)), _LEAST_SCALE)
+        deviation = jnp.std(seen, axis=(0, 1))
+        scale = jnp.where(deviation < _CONSTANT, 1.0, deviation)
         return {"world": world, "seen": {"mean": jnp.mean(seen, axis=(0, 1)), "scale": scale}}
 
     def pose(self, params: Any, observation: jax.Array) -> jax.Array:
