@@ -32,7 +32,8 @@ class _Process:
         cls.broken = cls.broken or xla_bridge.backends_are_initialized()
 
 
-os.register_at_fork(after_in_child=_Process.note_fork)
+if hasattr(os, "register_at_fork"):  # Windows has no forks
+    os.register_at_fork(after_in_child=_Process.note_fork)
 
 
 def require_threads() -> None:
