@@ -33,6 +33,7 @@ class PointEnv(Env):
     episode_length = 60
     backend = "toy"
     extra_size = 0
+    body_frame = None
 
     def reset(self, rng):
         return self.reset_to(0.1 * jax.random.normal(rng, (2,)), jnp.zeros(2), GOAL, rng)

@@ -178,7 +178,9 @@ def test_states_without_their_discrete_part_are_refused(env: reacher.Reacher, fi
 
 def test_rollouts_of_skills_start_from_the_whole_state(env: reacher.Reacher, file: Path) -> None:
     data, _ = to_device(formats.read(file, env), HORIZON)
-    skills: Any = SimpleNamespace(act=lambda params, observation, skill: skill)
+    skills: Any = SimpleNamespace(
+        act=lambda params, observation, skill: skill, begin=lambda params, latent, observation: latent
+    )
     rollout = PhysicsRollout(env, skills, lambda observation: observation, HORIZON)
     starts = data.starts[::400]
     latent = np.random.default_rng(0).uniform(-1, 1, (len(starts), 2)).astype(np.float32)
