@@ -299,12 +299,7 @@ def _data_file(config: Config, env: Any) -> tuple[Path, str | None]:
 def _record_origin(folder: RunFolder, data: _Data) -> None:
     """Write run.json: command, data and packages; on resume, refuse other data than at the start."""
     if folder.provenance.exists():
-        earlier = folder.read_origin()["dataset"]["sha256"]
-        if earlier != data.sha256:
-            raise UserError(
-                f"{data.path} is not the file that the run began with "
-                f"(SHA-256 {data.sha256[:12]}, then {earlier[:12]}); restore it, or start a new run"
-            )
+        relocation.check_same(folder, data.path, data.sha256)
         return
     content = {
         "command": sys.argv,

@@ -28,7 +28,8 @@ def relocate(path: str, dataset: str) -> None:
     folders = list(comparison.runs(Path(path)).values()) if comparison.is_comparison(path) else [RunFolder.open(path)]
     folders += [share for folder in folders for share in shares.shares_of(folder)]
     for folder in folders:
-        _check_same(folder, str(file), digest)
+        if folder.provenance.exists():  # else it has not begun
+            check_same(folder, file, digest)
     for folder in folders:
         with folder.held():
             config = configs.from_yaml(folder.config)
@@ -51,12 +52,11 @@ def check_data(folder: RunFolder, config: Config) -> None:
         ) from error
 
 
-def _check_same(folder: RunFolder, file: str, digest: str) -> None:
-    if not folder.provenance.exists():  # it has not begun
-        return
+def check_same(folder: RunFolder, file: Path, digest: str) -> None:
+    """Raise UserError unless ``file``, whose SHA-256 is ``digest``, is what the run, which has begun, began with."""
     earlier = folder.read_origin()["dataset"]["sha256"]
     if earlier != digest:
         raise UserError(
             f"{file} is not the file that the run in {folder.path} began with "
-            f"(SHA-256 {digest[:12]}, then {earlier[:12]}); name that file, or start a new run"
+            f"(SHA-256 {digest[:12]}, then {earlier[:12]}); restore it or name it with --dataset, or start a new run"
         )

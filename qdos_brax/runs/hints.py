@@ -8,25 +8,16 @@ from pathlib import Path
 _CHECKOUT = (Path(__file__).parents[2] / "train.py").is_file()  # an installed wheel has no train.py
 
 
-def train_command(*arguments: str | Path) -> str:
-    """Return the command that trains with these arguments: ``train.py`` where there is one, else the module."""
-    return _command("train.py" if _CHECKOUT else "-m qdos_brax train", arguments)
+def module_command(*arguments: str | Path) -> str:
+    """Return the command ``python -m qdos_brax`` with these arguments."""
+    return f"python -m qdos_brax {shlex.join(map(str, arguments))}"
 
 
 def resume_command(path: str | Path) -> str:
-    """Return the command that continues the run in ``path``."""
-    return train_command("--resume", path)
-
-
-def module_command(*arguments: str | Path) -> str:
-    """Return the command ``python -m qdos_brax`` with these arguments."""
-    return _command("-m qdos_brax", arguments)
+    """Return the command that continues the run in ``path``: by ``train.py`` where there is one, else the module."""
+    return f"python {'train.py' if _CHECKOUT else '-m qdos_brax train'} {resume_flag(path)}"
 
 
 def resume_flag(path: str | Path) -> str:
     """Return the flag that continues the run in ``path``."""
     return shlex.join(["--resume", str(path)])
-
-
-def _command(program: str, arguments: tuple[str | Path, ...]) -> str:
-    return f"python {program} {shlex.join(map(str, arguments))}"

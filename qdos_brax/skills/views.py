@@ -101,8 +101,8 @@ class StartView:
 
     def see(self, params: Any, observation: jax.Array, pose: jax.Array) -> jax.Array:
         """Return the observation in the frame of the pose, normalised."""
-        seen = jax.lax.stop_gradient(params["seen"])
-        return (self._frame.see(_raw(params, observation), pose) - seen["mean"]) / seen["scale"]
+        normalise = Normaliser(**jax.lax.stop_gradient(params["seen"]))
+        return normalise(self._frame.see(_raw(params, observation), pose))
 
 
 class BodyView(StartView):
