@@ -16,7 +16,15 @@ import jax
 
 import envs
 from qdos_brax import config as configs
-from qdos_brax.analysis.conclusion import conclude, listed, print_files, read_finished, with_alpha
+from qdos_brax.analysis.conclusion import (
+    conclude,
+    listed,
+    load_beside,
+    print_files,
+    read_finished,
+    report_on,
+    with_alpha,
+)
 from qdos_brax.analysis.finished import trained_run
 from qdos_brax.collection.default_set import default_dataset
 from qdos_brax.config import Config
@@ -28,7 +36,6 @@ from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.methods.build import bind_phases, build_context, build_phases, plan_members
 from qdos_brax.population.members import Population
-from qdos_brax.report.write import write_report
 from qdos_brax.runs import comparison, observers, shares, signals
 from qdos_brax.runs.checkpoint import Artifacts
 from qdos_brax.runs.fingerprints import sha256
@@ -159,7 +166,7 @@ def _compare(path: Path, started: float, chosen: bool) -> None:
                 raise
             jax.clear_caches()  # the next run's programs are others
             started = time.perf_counter()
-        report = write_report([path], path)
+        report = report_on(path)
     print(f"\n{report.text}\n\ncompared {', '.join(folders)}")
     print_files(report)
 
@@ -249,6 +256,7 @@ def _train(
         The configuration with the members of a program as planned, the summary, and what was learned.
     """
     _record_origin(folder, data)
+    load_beside()
     context = build_context(config, data.env, data.dataset)
     phases = build_phases(context)
     found = plan_members(context, phases, members)

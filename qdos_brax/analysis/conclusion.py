@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from qdos_brax.analysis.finished import TrainedRun, load_run
 from qdos_brax.config.methods import METHODS
 from qdos_brax.data import formats
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.errors import UserError
-from qdos_brax.report.write import Report, write_report
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import module_command
+
+if TYPE_CHECKING:
+    from qdos_brax.report.write import Report
+
+_AT_THE_END = ("qdos_brax.report.write", "qdos_brax.analysis.inside")
+
+
+def load_beside() -> None:
+    """Import Matplotlib, SciPy's statistics and scikit-learn on a thread, while the run trains: 1.5 s for its end."""
+    threading.Thread(target=lambda: [importlib.import_module(name) for name in _AT_THE_END], daemon=True).start()
 
 
 def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[], tuple[TrainedRun, Dataset]]) -> None:
@@ -27,13 +38,13 @@ def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[
         finished: returns what the run learned, and its data; called only if there is no analysis yet.
     """
     if not folder.inside.exists():
-        from qdos_brax.analysis.inside import look_inside  # here, because scikit-learn takes its time
+        from qdos_brax.analysis.inside import look_inside
 
         try:
             look_inside(*finished(), folder.inside)
         except Exception as error:  # whatever it is: the run is done, and the page does without
             print(f"inside    left out: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr, flush=True)
-    report = write_report([folder.path], folder.path)
+    report = report_on(folder.path)
     print(f"\ndone in {summary['wall_seconds']['total'] / 60:.1f} minutes")
     for member in summary["members"]:
         print(f"  {with_alpha(summary['method'], member['alpha'])}seed {member['seed']}: {_result(member)}")
@@ -64,6 +75,13 @@ def read_finished(folder: RunFolder) -> tuple[TrainedRun, Dataset]:
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"cannot read from {folder.provenance} which data the run had ({error})") from error
     return trained, formats.read(path, trained.env)
+
+
+def report_on(path: Path) -> Report:
+    """Write the report on the run or the comparison in ``path`` into it; errors as ``write_report``."""
+    from qdos_brax.report.write import write_report  # here, so that a run starts before Matplotlib is there
+
+    return write_report([path], path)
 
 
 def print_files(report: Report) -> None:

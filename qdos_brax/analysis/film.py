@@ -77,5 +77,11 @@ class EpisodeRunner:
 
 def of_member(trained: TrainedRun, member: int) -> tuple[Any, Any]:
     """Return (artifacts, hyper) of one member, as ``trained.agent`` takes them."""
-    artifacts, hyper = jax.tree.map(lambda x: x[member], (trained.artifacts, trained.hyper))
+    return _of_index((trained.artifacts, trained.hyper), member)
+
+
+@jax.jit
+def _of_index(trees: tuple[Any, Any], index: int) -> tuple[Any, Any]:
+    """Return the entries at an index of the first axis, by one program."""
+    artifacts, hyper = jax.tree.map(lambda leaf: leaf[index], trees)
     return artifacts, hyper

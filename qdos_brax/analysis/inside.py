@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,8 +73,12 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
     members = _first_seeds(trained)
     arrays: Arrays = {"members": np.asarray(members), **_place(trained.env), **_truth(trained, sample)}
     latents, runner = _LatentView(trained, sample), EpisodeRunner(trained)
-    for member in members:
-        found = _weights(trained, member, sample) | latents.of(member) | _episode(trained, runner, member)
+    views = {member: latents.of(member) for member in members}
+    with ThreadPoolExecutor(1) as beside:  # t-SNE on one core while the episodes are played on another
+        embeddings = beside.map(embedded, [view.get("latent", np.zeros((0, 0))) for view in views.values()])
+        episodes = [_episode(trained, runner, member) for member in members]
+    for member, embedding, episode in zip(members, embeddings, episodes, strict=True):
+        found = _weights(trained, member, sample) | views[member] | embedding | episode
         arrays |= {f"{member}/{name}": array for name, array in found.items()}
     write_arrays(out, arrays)
 
@@ -151,10 +156,9 @@ class _LatentView:
 
     def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
         horizon, data = trained.config.skills.horizon, sample.data
-        starts = jnp.asarray(sample.starts)
         self._trained = trained
-        self._segments = Segments(*window((data.observations, data.actions), starts, horizon))
-        self._after = data.next_observations[starts + horizon - 1]
+        self._segments = Segments(*window((data.observations, data.actions), sample.starts, horizon))
+        self._after = np.asarray(data.next_observations)[sample.starts + horizon - 1]
         self._steps = min(_HELD * horizon, trained.env.episode_length)
         self._posterior = jax.jit(make_low_level(trained.config, trained.env).posterior)
         self._play = jax.jit(jax.vmap(self._path, in_axes=(None, None, 0)))
@@ -167,12 +171,11 @@ class _LatentView:
         latents = np.asarray(self._posterior(artifacts["skills"], self._segments, self._after).mean)
         if not np.isfinite(latents).all():  # the member was frozen
             return {}
-        found = {"latent": latents, **embedded(latents)}
         if self._trained.env.floor_map() is None:
-            return found
+            return {"latent": latents}
         grid, between = _grid(latents), _between(latents)
         paths = np.asarray(self._play(artifacts, hyper, np.concatenate([grid, between])), np.float32)
-        return found | {"grid": paths[: len(grid)], "between": paths[len(grid) :]}
+        return {"latent": latents, "grid": paths[: len(grid)], "between": paths[len(grid) :]}
 
     def _path(self, artifacts: Any, hyper: Any, latent: jax.Array) -> jax.Array:
         """Return float[T + 1, 2], the positions from the start on while one latent is begun again and again."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TypeVar
 
 import jax
@@ -33,10 +34,11 @@ def episode_last(ends: np.ndarray) -> np.ndarray:
     return np.repeat(bounds[:, 1] - 1, bounds[:, 1] - bounds[:, 0]).astype(np.int32)
 
 
+@partial(jax.jit, static_argnums=2)
 def window(tree: Tree, starts: jax.Array, horizon: int) -> Tree:
     """Return the windows that begin at ``starts[B]``: every leaf [N, ...] of ``tree`` becomes [B, horizon, ...].
 
-    For use inside jit; ``starts`` must come from ``segment_starts``, since an index past the end is clamped.
+    ``starts`` must come from ``segment_starts``, since an index past the end is clamped.
     """
     rows = starts[..., None] + jnp.arange(horizon)
     return jax.tree.map(lambda leaf: leaf[rows], tree)

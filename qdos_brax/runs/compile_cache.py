@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -9,6 +10,9 @@ from pathlib import Path
 
 import jax
 import jaxlib
+
+LARGEST = 2 * 2**30
+"""Bytes that the folder of compiled programs may hold when a process starts to use it."""
 
 
 def cache_folder() -> Path:
@@ -33,9 +37,31 @@ def enable() -> Path | None:
         return None
     if not os.access(folder, os.W_OK):
         return None
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        trim(folder, LARGEST)
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    # A run compiles some hundred programs of one operation each: 40 ms apiece, and 4 ms to read.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return folder
+
+
+def trim(folder: Path, largest: int) -> None:
+    """Delete the programs that were not used for longest until the rest take at most ``largest`` bytes.
+
+    jax's own bound (``jax_compilation_cache_max_size``) reads the whole folder at every write. A program that another
+    process is about to read may go: that process compiles it.
+    """
+    found = []
+    for path in folder.glob("*-cache"):
+        with contextlib.suppress(FileNotFoundError):  # two processes trim at once
+            status = path.stat()
+            found.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= largest:
+            return
+        path.unlink(missing_ok=True)
+        total -= size
 
 
 def _machine() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 import jax
@@ -38,13 +39,13 @@ class GraphPhase(MemberPhase):
 
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[jax.Array, dict[str, Any]]:
         """Return float32[members, N], the value of every logged state, yet to be found, and no constants."""
-        return jnp.zeros((self._members, self.data.rewards.shape[0])), {}
+        return jnp.asarray(np.zeros((self._members, len(self.data.rewards)), np.float32)), {}
 
     def chunk(self, state: jax.Array, constants: dict[str, Any]) -> tuple[jax.Array, dict[str, np.ndarray]]:
         """Return the values: minus the cost of the way to success."""
         costs = graph_costs(self._values, self._skills.horizon, self.data, self._ends)
         found = {"update": np.ones(self._members), "cost_to_go": np.full(self._members, costs.mean())}
-        return jnp.tile(-jnp.asarray(costs), (self._members, 1)), found
+        return jnp.asarray(np.tile(-costs, (self._members, 1))), found
 
     def working_bytes(self, state: Any, constants: Any) -> int:
         """Return 0: the search is the host's."""
@@ -56,13 +57,17 @@ class GraphPhase(MemberPhase):
         Data goes on after a success, and so does this task: to stay there costs nothing, to leave it is a loss. Where
         an episode ends, the value after its last row is that row's, for the state behind it is no row of the data.
         """
-        value = state[0]
-        following = jnp.where(self._ends, value, jnp.roll(value, -1))
-        costs = jnp.asarray(step_costs(np.asarray(self.data.rewards)), value.dtype)
-        endless = self.data.replace(rewards=-costs, masks=jnp.ones_like(costs))
+        value, costs = np.asarray(state[0]), step_costs(np.asarray(self.data.rewards)).astype(np.float32)
+        following = np.where(self._ends, value, np.roll(value, -1))
+        scaled = np.asarray(self._advantages(value, following, costs, self.data))
+        return artifacts | {"advantage": jnp.asarray(np.tile(scaled, (self._members, 1)))}
+
+    @partial(jax.jit, static_argnums=0)
+    def _advantages(self, value: jax.Array, following: jax.Array, costs: jax.Array, data: DeviceData) -> jax.Array:
+        """Return the scaled advantage of every segment, [S]."""
+        endless = data.replace(rewards=-costs, masks=jnp.ones_like(costs))
         advantage = segment_advantages(value, following, endless, self._skills.horizon, jnp.ones(()))
-        scaled = scaled_advantage(advantage, self._skills.advantage_scale)
-        return artifacts | {"advantage": jnp.tile(scaled, (self._members, 1))}
+        return scaled_advantage(advantage, self._skills.advantage_scale)
 
 
 def graph_costs(values: ValuesConfig, horizon: int, data: DeviceData, ends: np.ndarray) -> np.ndarray:

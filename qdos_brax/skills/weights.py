@@ -44,6 +44,7 @@ def normal_scores(x: jax.Array) -> jax.Array:
     return ndtri((below + up_to) / (2 * x.shape[0]))
 
 
+@jax.jit
 def advantage_weights(advantage: jax.Array, temperature: jax.Array | float, clip: jax.Array | float) -> jax.Array:
     """Return exp(A / lambda), normalised over the batch to mean 1, clipped above (paper, eq. 2).
 

@@ -61,7 +61,7 @@ def read_actor(path: Path) -> Actor:
     try:
         with np.load(path, allow_pickle=False) as file:
             header = json.loads(file["header"].tobytes())
-            flat = {tuple(k.split("/")): jnp.asarray(file[k]) for k in file.files if k != "header"}
+            flat = {tuple(k.split("/")): file[k] for k in file.files if k != "header"}
         params = traverse_util.unflatten_dict(flat)
         last = max(params["params"]["MLP_0"])  # Dense_0, Dense_1, ..
         dim = params["params"]["MLP_0"][last]["bias"].shape[0] // 2
