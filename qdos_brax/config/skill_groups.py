@@ -46,7 +46,9 @@ class ValuesConfig:
         high=1.0,
         scan=False,
     )
-    max_nodes: int = count(20_000, "(graph) approximate number of logged states that become nodes")
+    max_nodes: int = count(
+        200_000, "(graph) most logged states that become nodes: a tenth of them do, or 20,000 if that is more"
+    )
     neighbours: int = count(20, "(graph) jumps from each node to its nearest, and as many to those of other episodes")
     jump_cost: float = number(
         1.0, "(graph) cost of a jump, in units of the time in which the data changes as far", above=True, scan=False

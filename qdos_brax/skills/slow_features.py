@@ -13,6 +13,7 @@ import sys
 import numpy as np
 import scipy.linalg
 
+_BLOCK = 50_000  # rows
 _SMALLEST_VARIANCE = 1e-6  # of a principal direction, relative to the largest: below it lie copies of other columns
 _SMALLEST_CHANGE = 1e-4  # 1 - autocorrelation: what never changes within an episode must not become infinitely far
 
@@ -33,13 +34,7 @@ def slow_features(
     Returns:
         float32[N, F], slowest first, each with mean square change 1 over ``lag`` steps.
     """
-    observations = np.asarray(observations, np.float64)
-    before, after = observations[starts], np.asarray(next_observations, np.float64)[starts + lag - 1]
-    mean = (before.mean(axis=0) + after.mean(axis=0)) / 2
-    before, after = before - mean, after - mean
-    covariance = (before.T @ before + after.T @ after) / (2 * len(starts))
-    lagged = (before.T @ after + after.T @ before) / (2 * len(starts))
-
+    mean, covariance, lagged = _moments(observations, next_observations, starts, lag)
     variance, axes = scipy.linalg.eigh(covariance)
     kept = variance > _SMALLEST_VARIANCE * variance[-1]
     whiten = axes[:, kept] / np.sqrt(variance[kept])
@@ -55,4 +50,38 @@ def slow_features(
     slow = autocorrelation >= min(slowness, largest)
     change = 2 * np.maximum(1 - autocorrelation[slow], _SMALLEST_CHANGE)  # mean square, of a feature of variance 1
     directions = whiten @ rotation[:, slow] / np.sqrt(change)
-    return np.ascontiguousarray(((observations - mean) @ directions)[:, ::-1], np.float32)
+    features = np.empty((len(observations), directions.shape[1]), np.float32)
+    for rows in _blocks(len(observations)):
+        features[rows] = ((observations[rows] - mean) @ directions)[:, ::-1]
+    return features
+
+
+def _moments(
+    observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, lag: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (mean[obs], covariance[obs, obs], symmetric lagged covariance[obs, obs]) of the windows' two ends.
+
+    In blocks, so that no float64 copy of the data is needed.
+    """
+    size = observations.shape[1]
+    total, covariance, lagged = np.zeros(size), np.zeros((size, size)), np.zeros((size, size))
+    for rows in _blocks(len(starts)):
+        before, after = _ends(observations, next_observations, starts[rows], lag)
+        total += before.sum(axis=0) + after.sum(axis=0)
+    mean = total / (2 * len(starts))
+    for rows in _blocks(len(starts)):
+        before, after = (end - mean for end in _ends(observations, next_observations, starts[rows], lag))
+        covariance += before.T @ before + after.T @ after
+        lagged += before.T @ after + after.T @ before
+    return mean, covariance / (2 * len(starts)), lagged / (2 * len(starts))
+
+
+def _ends(
+    observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, lag: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the windows' first and last states, float64[B, obs] each."""
+    return observations[starts].astype(np.float64), next_observations[starts + lag - 1].astype(np.float64)
+
+
+def _blocks(total: int) -> list[slice]:
+    return [slice(first, first + _BLOCK) for first in range(0, total, _BLOCK)]

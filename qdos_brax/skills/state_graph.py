@@ -12,16 +12,16 @@ Related: planning on a graph of replayed states (Eysenbach et al. 2019, SoRB), v
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import KDTree
 
 from qdos_brax.data.dataset import episode_bounds
 
-_BLOCK = 500  # nodes whose neighbours are sought at once: the table of distances fits the cache's outskirts
+_BLOCK = 20_000  # nodes whose neighbours are sought at once
+_INTERVAL = 10  # rows between two nodes, where there are enough for ``_ENOUGH`` nodes
+_ENOUGH = 20_000
 _LEAST_COST = 1e-6  # scipy takes an edge of weight 0 for none
 
 
@@ -50,7 +50,8 @@ def costs_to_go(
         features: float32[N, F]; distances in them, times ``jump_cost``, count in steps.
         costs: float[N], >= 0, of the step that leaves the row; 0 where there is nothing left to reach.
         ends: bool[N], the last row of each episode.
-        max_nodes: about how many rows become nodes; the rows between two nodes are interpolated.
+        max_nodes: of about a tenth of the rows, or of 20,000 if that is more, at most so many become nodes; the rows
+            between two nodes are interpolated.
         neighbours: jumps from every node to the nearest nodes of all, and as many to the nearest of other episodes.
         jump_cost: steps per unit of distance.
 
@@ -81,7 +82,7 @@ def _episode_numbers(ends: np.ndarray) -> np.ndarray:
 
 def _nodes(costs: np.ndarray, ends: np.ndarray, episode: np.ndarray, max_nodes: int) -> np.ndarray:
     """Rows at regular intervals from each episode's first; its last one, and those where a goal is entered, as well."""
-    interval = -(-len(costs) // max_nodes)
+    interval = -(-len(costs) // min(max_nodes, max(_ENOUGH, len(costs) // _INTERVAL)))
     bounds = episode_bounds(ends)
     chosen = (np.arange(len(costs)) - bounds[episode, 0]) % interval == 0
     chosen[bounds[:, 1] - 1] = True
@@ -92,20 +93,24 @@ def _nodes(costs: np.ndarray, ends: np.ndarray, episode: np.ndarray, max_nodes: 
 
 def _neighbours(points: np.ndarray, episode: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices[M, 2 count] of the nearest points of all, then of other episodes, and their distances[M, 2 count]."""
-    points = np.asarray(points, np.float32)
-    square = np.square(points).sum(axis=1)
-
-    def block(first: int) -> np.ndarray:
-        rows = np.arange(first, min(first + _BLOCK, len(points)))
-        order = square - 2 * points[rows] @ points.T  # the squared distance but for a constant per row
-        order[np.arange(len(rows)), rows] = np.inf
-        nearest = np.argpartition(order, count - 1, axis=1)[:, :count]
-        order[episode[rows, None] == episode] = np.inf
-        return np.concatenate([nearest, np.argpartition(order, count - 1, axis=1)[:, :count]], axis=1)
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        near = np.concatenate(list(pool.map(block, range(0, len(points), _BLOCK))))
+    tree, near = KDTree(points), np.empty((len(points), 2 * count), np.int64)
+    for first in range(0, len(points), _BLOCK):
+        rows, asked = np.arange(first, min(first + _BLOCK, len(points))), 4 * count
+        while len(rows):  # until all have enough among those that were asked for
+            asked = min(asked, len(points))
+            found = tree.query(points[rows], np.arange(1, asked + 1), workers=-1)[1]
+            others = episode[found] != episode[rows, None]
+            enough = others.sum(axis=1) >= count
+            wanted = (found != rows[:, None], others)
+            parts = [found[enough][_first_true(mask[enough], count)].reshape(-1, count) for mask in wanted]
+            near[rows[enough]] = np.concatenate(parts, axis=1)
+            rows, asked = rows[~enough], 4 * asked
     return near, np.linalg.norm(points[near] - points[:, None], axis=-1).astype(np.float64)
+
+
+def _first_true(mask: np.ndarray, count: int) -> np.ndarray:
+    """Return ``mask`` with only the first ``count`` of each row's true entries, of which there are enough."""
+    return mask & (np.cumsum(mask, axis=1) <= count)
 
 
 def _to_goal(edges: list[tuple[np.ndarray, np.ndarray, np.ndarray]], goal: np.ndarray) -> np.ndarray:
