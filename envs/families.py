@@ -34,7 +34,8 @@ class Family:
         engines: the engines it runs on: "mujoco" (MuJoCo C), "mjx", "mjx-warp" (MuJoCo Warp, on CUDA).
         variants: by name, as "large"; "" where the family's own name is the task's.
         default_variant: the one that the family's name alone stands for.
-        default_task: the task of a name without "-taskN" (as OGBench's single-task mode).
+        default_task: the task of a variant's name without "-taskN" (as OGBench's single-task mode).
+        alias_task: the task that the family's name alone stands for; None for ``default_task``.
     """
 
     make: str | Callable[[TaskSpec, str], Any]
@@ -42,6 +43,7 @@ class Family:
     variants: Mapping[str, Variant]
     default_variant: str
     default_task: int = 1
+    alias_task: int | None = None
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ def register_family(name: str, family: Family) -> None:
         raise ValueError(f"family {name!r} has no variant {family.default_variant!r} to take by default")
     FAMILIES[name] = family
     if family.default_variant:
-        ALIASES[name] = f"{name}-{family.default_variant}"
+        task = "" if family.alias_task is None else f"-task{family.alias_task}"
+        ALIASES[name] = f"{name}-{family.default_variant}{task}"
 
 
 def list_tasks() -> list[TaskSpec]:
@@ -51,9 +52,8 @@ def get_spec(name: str) -> TaskSpec:
     Raises:
         ValueError: there is no such task; the message proposes the nearest.
     """
-    match = re.fullmatch(r"(.*?)(?:-task(\d+))?", name)
-    base, task = match.group(1, 2) if match else (name, None)
-    base = ALIASES.get(base, base)
+    base, task = _split(ALIASES.get(name, name))
+    base = _split(ALIASES.get(base, base))[0]
     specs = {spec.full_name: spec for spec in list_tasks()}
     family = FAMILIES.get(base.split("-")[0])
     task_id = int(task) if task else family and family.default_task
@@ -63,6 +63,12 @@ def get_spec(name: str) -> TaskSpec:
     known = [*ALIASES, *dict.fromkeys(spec.name for spec in specs.values()), *specs]
     near = max(known, key=lambda other: difflib.SequenceMatcher(None, other, name).ratio())
     raise ValueError(f"there is no task {name!r}; did you mean {near!r}? (tasks: {', '.join(known[: -len(specs)])})")
+
+
+def _split(name: str) -> tuple[str, str | None]:
+    """Return the name without "-taskN", and N."""
+    match = re.fullmatch(r"(.*?)(?:-task(\d+))?", name)
+    return match.group(1, 2) if match else (name, None)
 
 
 def make(name: str, physics: str = "auto") -> Task:

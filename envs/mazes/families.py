@@ -72,6 +72,7 @@ MAZE_FAMILIES = {
         variants=_variants("antsoccer", 42, 8, dict.fromkeys(_TASKS["antsoccer"], 1000)),
         default_variant="arena",
         default_task=4,
+        alias_task=1,  # that of the paper's figures
     ),
     "humanoidmaze": Family(
         make="envs.mazes.locomotion:HumanoidMaze",

@@ -120,7 +120,7 @@ def _picture(args: argparse.Namespace) -> int:
 def _tasks(args: argparse.Namespace) -> int:
     import envs
 
-    aliases = {target: alias for alias, target in envs.ALIASES.items()}
+    aliases = {(spec.name, spec.task_id): alias for alias in envs.ALIASES for spec in [envs.get_spec(alias)]}
     counts = Counter(spec.name for spec in envs.list_tasks())
     rows = [["task", "observation", "action", "cap", "engines", "variants", "default", "alias"]]
     for name, count in counts.items():
@@ -128,7 +128,12 @@ def _tasks(args: argparse.Namespace) -> int:
         family = envs.FAMILIES[default.family]
         variant = family.variants[default.variant]
         sizes = map(str, (variant.observation_size, variant.action_size, variant.episode_length))
-        variants = [f"task1 to task{count}", f"task{default.task_id}", aliases.get(name, "")]
+        alias = [
+            short if task == default.task_id else f"{short} (task{task})"
+            for (full, task), short in aliases.items()
+            if full == name
+        ]
+        variants = [f"task1 to task{count}", f"task{default.task_id}", *(alias or [""])]
         rows.append([name, *sizes, ", ".join(family.engines), *variants])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:

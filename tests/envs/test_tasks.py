@@ -47,7 +47,8 @@ def test_every_task_resets_and_steps(spec: envs.TaskSpec) -> None:
 
 def test_names() -> None:
     assert envs.get_spec("antmaze").full_name == "antmaze-large-task1"
-    assert envs.get_spec("antsoccer").full_name == "antsoccer-arena-task4"
+    assert envs.get_spec("antsoccer").full_name == "antsoccer-arena-task1"  # the paper's
+    assert envs.get_spec("antsoccer-arena").full_name == "antsoccer-arena-task4"  # OGBench's
     assert envs.get_spec("antsoccer-task2").full_name == "antsoccer-arena-task2"
     assert envs.get_spec("humanoidmaze").full_name == "humanoidmaze-medium-task1"
     assert envs.get_spec("antmaze-teleport").full_name == "antmaze-teleport-task1"
