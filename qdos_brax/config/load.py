@@ -117,24 +117,34 @@ def check_method(config: Config) -> None:
         raise UserError(
             f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, not {horizon}"
         )
+    high = config.high_level
+    if high.utd % high.actor_updates:
+        raise UserError(
+            f"high_level.utd ({high.utd}) must be a multiple of high_level.actor_updates ({high.actor_updates}): as many "
+            "critic steps lie between any two of the actor's"
+        )
     if method.weighted and config.values.estimator == "iql" and config.values.n_step > horizon:
         raise UserError(f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({horizon})")
+
+
+_AS_BEFORE = {("skills", "view"): "world", ("high_level", "actor_updates"): 1}
 
 
 def config_hash(config: Config) -> str:
     """Return 16 hex digits over everything that decides the result, which neither folders nor the ``run`` group do.
 
     Values without effect are left out too, so that runs from before such a key existed can be read: the scan group if
-    it has its defaults, the view of skills if it is the world's, and the members per program if there is one member or
-    no number was given.
+    it has its defaults, the keys of ``_AS_BEFORE`` at the values that say what was done before there was a choice, and
+    the members per program if there is one member or no number was given.
     """
     content = plain(config)
     for key in ("out", "dataset", "run"):
         del content[key]
     if config.scan == Config().scan:
         del content["scan"]
-    if config.skills.view == "world":
-        del content["skills"]["view"]
+    for (group, key), value in _AS_BEFORE.items():
+        if content[group][key] == value:
+            del content[group][key]
     if config.members_per_program == 0 or len(scan.members(config)) == 1:
         del content["members_per_program"]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

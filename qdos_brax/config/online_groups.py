@@ -40,6 +40,9 @@ class HighLevelConfig:
     batch_size: int = count(256, "macro transitions per gradient step", low=2)
     offline_fraction: float = number(0.5, "share of a batch taken from the labelled data", high=1.0, scan=False)
     utd: int = count(20, "critic steps per macro step of experience")
+    actor_updates: int = count(
+        1, "steps of actor and temperature per macro step, evenly among the critics' (SUPE: 4 among 80)"
+    )
     learning_rate: Scannable = rate(3e-4, "Adam learning rate of actor, critics and temperature")
     discount: Scannable = number(0.99, "discount per macro step", high=1.0)
     target_rate: Scannable = number(0.005, "Polyak rate of the target critics", high=1.0, above=True)

@@ -77,7 +77,7 @@ class Learning:
     def step(
         self, learners: Learners, given: tuple[jax.Array, Transition], env_steps: jax.Array, sources: Sources
     ) -> tuple[Learners, dict[str, jax.Array]]:
-        """Learn from one macro step: the labels' steps, ``utd`` of the critics, one of actor and temperature.
+        """Learn from one macro step: the labels' steps, ``utd`` of the critics, those of actor and temperature.
 
         Args:
             learners: before.
@@ -132,7 +132,7 @@ class Learning:
     def _learn_sac(
         self, learners: Learners, critic_key: jax.Array, actor_key: jax.Array, sources: Sources
     ) -> tuple[SACState, dict[str, jax.Array]]:
-        """Make ``utd`` critic steps, then one of actor and temperature."""
+        """Make ``utd`` critic steps and ``actor_updates`` of actor and temperature, which take turns."""
         hyper = sources.hyper
         target_entropy, reference = self._regulariser(sources.skills, hyper)
         sac_hyper = SACHyper(
@@ -147,10 +147,19 @@ class Learning:
             batch_key, update_key = jax.random.split(key)
             return self._sac.update_critic(sac, sample(batch_key), update_key, sac_hyper, reference)
 
-        sac, critic_info = jax.lax.scan(critic_step, learners.sac, jax.random.split(critic_key, self._high.utd))
-        batch_key, update_key = jax.random.split(actor_key)
-        sac, actor_info = self._sac.update_actor(sac, sample(batch_key).observation, update_key, sac_hyper, reference)
-        return sac, jax.tree.map(jnp.mean, critic_info) | actor_info
+        def turn(sac: SACState, keys: tuple[jax.Array, jax.Array]) -> tuple[SACState, dict[str, jax.Array]]:
+            critic_keys, actor_key = keys
+            sac, critic_info = jax.lax.scan(critic_step, sac, critic_keys)
+            batch_key, update_key = jax.random.split(actor_key)
+            observation = sample(batch_key).observation
+            sac, actor_info = self._sac.update_actor(sac, observation, update_key, sac_hyper, reference)
+            return sac, jax.tree.map(jnp.mean, critic_info) | actor_info
+
+        turns = self._high.actor_updates
+        critic_keys = jax.random.split(critic_key, self._high.utd).reshape(turns, -1)
+        actor_keys = actor_key[None] if turns == 1 else jax.random.split(actor_key, turns)
+        sac, info = jax.lax.scan(turn, learners.sac, (critic_keys, actor_keys))
+        return sac, jax.tree.map(jnp.mean, info)
 
     def _regulariser(self, skills: Any, hyper: dict[str, jax.Array]) -> tuple[jax.Array, Reference | None]:
         """Return the entropy that the temperature aims at, and the density it is relative to."""

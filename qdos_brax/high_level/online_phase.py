@@ -52,9 +52,9 @@ class OnlinePhaseState(struct.PyTreeNode):
 class OnlinePhase(MemberPhase):
     """Run SAC over skills, or over actions where the low-level policy has no skills.
 
-    Each iteration plays one macro step in every environment, stores them, and makes ``utd`` critic steps, one actor
-    and one temperature step per macro step played. Of a batch, ``offline_fraction`` is labelled data, the rest online
-    experience.
+    Each iteration plays one macro step in every environment, stores them, and makes ``utd`` critic steps and
+    ``actor_updates`` of actor and temperature per macro step played. Of a batch, ``offline_fraction`` is labelled data,
+    the rest online experience.
 
     Args:
         config: the run's configuration.
