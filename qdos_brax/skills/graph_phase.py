@@ -57,17 +57,17 @@ class GraphPhase(MemberPhase):
         Data goes on after a success, and so does this task: to stay there costs nothing, to leave it is a loss. Where
         an episode ends, the value after its last row is that row's, for the state behind it is no row of the data.
         """
-        value, costs = np.asarray(state[0]), step_costs(np.asarray(self.data.rewards)).astype(np.float32)
-        following = np.where(self._ends, value, np.roll(value, -1))
-        scaled = np.asarray(self._advantages(value, following, costs, self.data))
-        return artifacts | {"advantage": jnp.asarray(np.tile(scaled, (self._members, 1)))}
+        costs = step_costs(np.asarray(self.data.rewards)).astype(np.float32)
+        return artifacts | {"advantage": self._advantages(state, costs, self._ends, self.data)}
 
     @partial(jax.jit, static_argnums=0)
-    def _advantages(self, value: jax.Array, following: jax.Array, costs: jax.Array, data: DeviceData) -> jax.Array:
-        """Return the scaled advantage of every segment, [S]."""
+    def _advantages(self, state: jax.Array, costs: jax.Array, ends: jax.Array, data: DeviceData) -> jax.Array:
+        """Return the scaled advantage of every segment, [members, S]."""
+        value = state[0]
+        following = jnp.where(ends, value, jnp.roll(value, -1))
         endless = data.replace(rewards=-costs, masks=jnp.ones_like(costs))
         advantage = segment_advantages(value, following, endless, self._skills.horizon, jnp.ones(()))
-        return scaled_advantage(advantage, self._skills.advantage_scale)
+        return jnp.tile(scaled_advantage(advantage, self._skills.advantage_scale), (self._members, 1))
 
 
 def graph_costs(values: ValuesConfig, horizon: int, data: DeviceData, ends: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import pytest
 import envs
 from qdos_brax import config as configs
 from qdos_brax.config import Config, load_config, schema
+from qdos_brax.config.methods import METHODS
 from qdos_brax.errors import UserError
 
 pytestmark = pytest.mark.quick
@@ -174,6 +175,18 @@ def test_numbers_as_people_write_them() -> None:
     assert load_config("antmaze", "paper", sets=["high_level.hidden=64"]).high_level.hidden == (64,)
 
 
+def test_every_recipe_suits_every_preset() -> None:
+    for preset in ("smoke", "cpu", "paper"):
+        for method in METHODS:
+            for family in ("antmaze", "antsoccer", "humanoidmaze"):
+                configs.check_method(load_config(family, preset, {"method": method}))
+
+
+def test_runs_from_before_a_key_existed_keep_their_hash() -> None:
+    """The hash of such a run's configuration, as version 08c5c3e wrote it for ``--env antmaze --preset paper``."""
+    assert configs.config_hash(load_config("antmaze", "paper", sets=["values.max_nodes=20000"])) == "b1e5b68e2ed1b3c8"
+
+
 def test_settings_must_suit_the_method() -> None:
     """Found before data is read or collected; the graph has no return over several steps."""
     short = {"skills.horizon": 5, "values.n_step": 10}
@@ -181,5 +194,8 @@ def test_settings_must_suit_the_method() -> None:
         configs.check_method(load_config("antmaze", "smoke", {**short, "values.estimator": "iql"}))
     with pytest.raises(UserError, match=r"rlpd has no skills.*horizon must stay 1, not 5"):
         configs.check_method(load_config("antmaze", "smoke", {**short, "method": "rlpd"}))
+    updates = {"high_level.utd": 10, "high_level.actor_updates": 4}
+    with pytest.raises(UserError, match=r"utd \(10\) must be a multiple of high_level\.actor_updates \(4\)"):
+        configs.check_method(load_config("antmaze", "smoke", updates))
     for other in ({"values.estimator": "graph"}, {"method": "supe"}, {"method": "iql", "skills.horizon": 1}):
         configs.check_method(load_config("antmaze", "smoke", {**short, **other}))

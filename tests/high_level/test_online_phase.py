@@ -246,6 +246,20 @@ def test_the_bonus_learns_every_macro_step_once_and_the_labeller_as_often_as_the
     assert int(learners.labeller["rows"][0]) == 3 * played * round(0.75 * config.high_level.batch_size)
 
 
+def test_actor_steps_lie_evenly_among_the_critics(plane):
+    counts = {}
+    for actor_updates in (1, 2, 4):
+        config = point_config(**{"high_level.utd": 4, "high_level.actor_updates": actor_updates})
+        phase, artifacts, keys = online_phase(plane, config)
+        state, _ = phase.chunk(*phase.init(keys, artifacts))
+        played, sac = int(state.acting.replay.size[0]), state.learners.sac
+        steps = [int(opt_state.count[0]) for opt_state in (sac.critic_opt_state, sac.actor_opt_state)]
+        assert steps == [4 * played, actor_updates * played]
+        assert int(sac.temperature_opt_state.count[0]) == steps[1] and int(state.update[0]) == steps[0]
+        counts[actor_updates] = played
+    assert len(set(counts.values())) == 1
+
+
 def test_rnd_error_falls_where_it_was_trained_and_stays_elsewhere():
     rnd = RND(3, (32, 32), 16)
     state = rnd.init(jax.random.key(0))
