@@ -1,4 +1,4 @@
-"""Measure this tree beside another one, run by run: ``python benchmarks/against.py OTHER [--jobs smoke ..] [--out FILE]``.
+"""Measure this tree beside another one: ``python benchmarks/against.py OTHER [--jobs smoke ..] [--out FILE]``.
 
 OTHER is a checkout of an older commit (``git worktree add --detach OTHER 08c5c3e``); both run in this Python, each with
 compiled programs and data of its own. The jobs:

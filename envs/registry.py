@@ -67,8 +67,8 @@ def get_spec(name: str) -> TaskSpec:
 
 def _split(name: str) -> tuple[str, str | None]:
     """Return the name without "-taskN", and N."""
-    match = re.fullmatch(r"(.*?)(?:-task(\d+))?", name)
-    return match.group(1, 2) if match else (name, None)
+    base, _, task = name.rpartition("-task")
+    return (base, task) if base and task.isdecimal() else (name, None)
 
 
 def make(name: str, physics: str = "auto") -> Task:

@@ -18,11 +18,10 @@ import envs
 from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import (
     conclude,
+    conclude_comparison,
     listed,
     load_beside,
-    print_files,
     read_finished,
-    report_on,
     with_alpha,
 )
 from qdos_brax.analysis.finished import trained_run
@@ -166,9 +165,7 @@ def _compare(path: Path, started: float, chosen: bool) -> None:
                 raise
             jax.clear_caches()  # the next run's programs are others
             started = time.perf_counter()
-        report = report_on(path)
-    print(f"\n{report.text}\n\ncompared {', '.join(folders)}")
-    print_files(report)
+        conclude_comparison(path, list(folders))
 
 
 def _continue(folder: RunFolder, started: float, chosen: bool, hosts: Hosts = ALONE) -> None:

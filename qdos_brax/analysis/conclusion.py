@@ -6,7 +6,7 @@ import importlib
 import json
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ _AT_THE_END = ("qdos_brax.report.write", "qdos_brax.analysis.inside")
 
 
 def load_beside() -> None:
-    """Import Matplotlib, SciPy's statistics and scikit-learn on a thread, while the run trains: 1.5 s for its end."""
+    """Load Matplotlib, SciPy's statistics and scikit-learn on a thread, while the run trains: 1.5 s for its end."""
     threading.Thread(target=lambda: [importlib.import_module(name) for name in _AT_THE_END], daemon=True).start()
 
 
@@ -44,12 +44,12 @@ def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[
             look_inside(*finished(), folder.inside)
         except Exception as error:  # whatever it is: the run is done, and the page does without
             print(f"inside    left out: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr, flush=True)
-    report = report_on(folder.path)
+    report = _report_on(folder.path)
     print(f"\ndone in {summary['wall_seconds']['total'] / 60:.1f} minutes")
     for member in summary["members"]:
         print(f"  {with_alpha(summary['method'], member['alpha'])}seed {member['seed']}: {_result(member)}")
     print(f"summary   {folder.summary}")
-    print_files(report)
+    _print_files(report)
     print(f"evaluate  {module_command('evaluate', folder.path)}", flush=True)
 
 
@@ -77,14 +77,21 @@ def read_finished(folder: RunFolder) -> tuple[TrainedRun, Dataset]:
     return trained, formats.read(path, trained.env)
 
 
-def report_on(path: Path) -> Report:
+def conclude_comparison(path: Path, names: Sequence[str]) -> None:
+    """Write the report on the comparison in ``path``, and print its tables and files."""
+    report = _report_on(path)
+    print(f"\n{report.text}\n\ncompared {', '.join(names)}")
+    _print_files(report)
+
+
+def _report_on(path: Path) -> Report:
     """Write the report on the run or the comparison in ``path`` into it; errors as ``write_report``."""
     from qdos_brax.report.write import write_report  # here, so that a run starts before Matplotlib is there
 
     return write_report([path], path)
 
 
-def print_files(report: Report) -> None:
+def _print_files(report: Report) -> None:
     """Print where the page and the curves are."""
     print(f"report    {report.page}")
     print(f"curves    {report.curves}", flush=True)

@@ -157,7 +157,9 @@ class _LatentView:
     def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
         horizon, data = trained.config.skills.horizon, sample.data
         self._trained = trained
-        self._segments = Segments(*window((data.observations, data.actions), sample.starts, horizon))
+        self._segments = Segments(
+            *jax.jit(window, static_argnums=2)((data.observations, data.actions), sample.starts, horizon)
+        )
         self._after = np.asarray(data.next_observations)[sample.starts + horizon - 1]
         self._steps = min(_HELD * horizon, trained.env.episode_length)
         self._posterior = jax.jit(make_low_level(trained.config, trained.env).posterior)

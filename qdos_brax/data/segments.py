@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TypeVar
 
 import jax
@@ -34,7 +33,6 @@ def episode_last(ends: np.ndarray) -> np.ndarray:
     return np.repeat(bounds[:, 1] - 1, bounds[:, 1] - bounds[:, 0]).astype(np.int32)
 
 
-@partial(jax.jit, static_argnums=2)
 def window(tree: Tree, starts: jax.Array, horizon: int) -> Tree:
     """Return the windows that begin at ``starts[B]``: every leaf [N, ...] of ``tree`` becomes [B, horizon, ...].
 

@@ -46,7 +46,7 @@ def enable() -> Path | None:
 
 
 def trim(folder: Path, largest: int) -> None:
-    """Delete the programs that were not used for longest until the rest take at most ``largest`` bytes.
+    """Remove the programs that were not used for longest until the rest take at most ``largest`` bytes.
 
     jax's own bound (``jax_compilation_cache_max_size``) reads the whole folder at every write. A program that another
     process is about to read may go: that process compiles it.

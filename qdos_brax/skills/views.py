@@ -128,7 +128,7 @@ def _raw(params: Any, observation: jax.Array) -> jax.Array:
 def fit_view(view: View, data: DeviceData, normaliser: Normaliser, horizon: int) -> dict[str, Any]:
     """Return what ``view`` must know of the data, from evenly spaced segments of ``horizon`` rows."""
     starts = data.starts[:: max(1, len(data.starts) // _SEGMENTS)]
-    return view.fit(window(data.observations, starts, horizon), normaliser)
+    return view.fit(jax.jit(window, static_argnums=2)(data.observations, starts, horizon), normaliser)
 
 
 def make_view(name: str, frame: BodyFrame | None) -> View:

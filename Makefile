@@ -1,0 +1,26 @@
+# See CONTRIBUTING.md.
+PYTHON = .venv/bin/python
+
+.PHONY: setup quick test check format ci
+
+setup:
+	python3 -m venv .venv
+	.venv/bin/pip install -c constraints.txt -e ".[test]"
+
+quick:
+	$(PYTHON) -m pytest -m quick
+
+test:
+	$(PYTHON) -m pytest -m "not slow"
+
+check:
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+format:
+	.venv/bin/ruff format .
+	.venv/bin/ruff check --fix .
+
+ci:
+	.ci/run

@@ -1,0 +1,69 @@
+"""README and docs: links lead somewhere, commands parse, the README stays short."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from qdos_brax.commands.main import main_parser
+from qdos_brax.commands.train import configs_from_args, train_parser
+
+pytestmark = pytest.mark.quick
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+FENCED = re.compile(r"^```[^\n]*\n(.*?)^```", re.M | re.S)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def code(page: Path) -> list[str]:
+    """The lines of a page's fenced blocks."""
+    return "".join(FENCED.findall(page.read_text(encoding="utf-8"))).splitlines()
+
+
+def commands(start: str) -> list[str]:
+    return [line.removeprefix(start) for page in PAGES for line in code(page) if line.startswith(start)]
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that a code host gives a page's headings."""
+    text = FENCED.sub("", page.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#+ (.+)$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in LINK.findall(page.read_text(encoding="utf-8")):
+        if "://" in link:
+            continue
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), f"{page.name} links to {link}"
+        assert not anchor or anchor in anchors(target), f"{page.name} links to {link}"
+
+
+@pytest.mark.parametrize("line", commands("python train.py "))
+def test_training_commands_can_be_typed(line: str) -> None:
+    args = train_parser().parse_args(shlex.split(line, comments=True))
+    assert args.resume or configs_from_args(args)
+
+
+@pytest.mark.parametrize("line", commands("python -m qdos_brax "))
+def test_other_commands_can_be_typed(line: str) -> None:
+    words = shlex.split(line, comments=True)
+    assert callable(main_parser(words).parse_args(words).run)
+
+
+def test_readme_is_short_and_has_two_commands_that_set_up() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 1200
+    assert len([line for line in code(ROOT / "README.md") if "-m venv" in line]) == 2
+
+
+def test_every_page_is_linked_from_the_readme() -> None:
+    linked = {link.partition("#")[0] for link in LINK.findall((ROOT / "README.md").read_text(encoding="utf-8"))}
+    assert {str(page.relative_to(ROOT)) for page in PAGES[1:]} <= linked
