@@ -63,8 +63,8 @@ def main_parser(argv: Sequence[str]) -> Parser:
     )
     report.set_defaults(run=_report)
 
-    picture = commands.add_parser("picture", help="draw a task at its start")
-    picture.add_argument("task", metavar="TASK", help="a task, as listed by: python -m qdos_brax tasks")
+    picture = commands.add_parser("picture", help="draw a task at its start, or an episode and the latents of a run")
+    picture.add_argument("subject", metavar="TASK|RUN", help="a task (python -m qdos_brax tasks), or a finished run")
     picture.add_argument("--out", metavar="FILE", required=True, help="the picture to write, as .png")
     picture.set_defaults(run=_picture)
 
@@ -110,9 +110,14 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _picture(args: argparse.Namespace) -> int:
-    from qdos_brax.report.picture import draw_task
+    if Path(args.subject).is_dir():
+        from qdos_brax.analysis.strip import draw_run
 
-    draw_task(args.task, Path(args.out))
+        draw_run(Path(args.subject), Path(args.out))
+    else:
+        from qdos_brax.report.picture import draw_task
+
+        draw_task(args.subject, Path(args.out))
     print(args.out)
     return 0
 

@@ -23,8 +23,7 @@ def draw_task(name: str, out: Path) -> None:
     Raises:
         UserError: there is no such task, this machine cannot draw, or the picture cannot be written.
     """
-    if out.suffix != ".png":
-        raise UserError(f"a picture is written as .png, not as {out.name}; choose another name for it")
+    check_name(out)
     try:
         env = envs.make(name, physics="mujoco")
         state = env.reset(jax.random.key(0))
@@ -34,3 +33,13 @@ def draw_task(name: str, out: Path) -> None:
         raise UserError(str(error)) from error
     with user_errors(out):
         matplotlib.image.imsave(out, image)
+
+
+def check_name(out: Path) -> None:
+    """Check that a picture's name ends in .png.
+
+    Raises:
+        UserError: it does not.
+    """
+    if out.suffix != ".png":
+        raise UserError(f"a picture is written as .png, not as {out.name}; choose another name for it")

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from envs import render
-from qdos_brax.analysis import film
+from qdos_brax.analysis import film, strip
 from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.commands import main as commands
 from qdos_brax.errors import UserError
 from qdos_brax.report.video import mp4
+from tests.report.folders import write_run
 
 CAP = 25
 
@@ -136,11 +137,33 @@ def test_picture_of_a_task(tmp_path: Path) -> None:
     assert row < 240 and column > 720  # task 1's goal lies in the upper right corner
 
 
+@pytest.mark.usefixtures("opengl")
+def test_picture_of_a_run(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    widths = []
+    for latents in (None, (np.random.default_rng(0).normal(size=(50, 2)), None)):
+        monkeypatch.setattr(strip, "_latents", lambda run, latents=latents: latents)
+        assert main(f"picture {finished} --out {tmp_path}/run.png") == 0
+        widths.append(matplotlib.image.imread(tmp_path / "run.png").shape[1])
+    assert widths[1] == widths[0] * 5 // 4  # four frames, and the map of latents beside them
+
+
+def test_latents_of_a_run_are_those_of_its_analysis(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", success=[0.5])
+    assert strip._latents(run) is None
+    places, gain = np.ones((3, 2), np.float32), np.arange(3.0)
+    np.savez(run / "inside.npz", **{"members": np.array([0]), "gain": gain, "0/tsne": places})
+    found = strip._latents(run)
+    np.testing.assert_array_equal(found[0], places)
+    np.testing.assert_array_equal(found[1], gain)
+
+
 def test_wrong_pictures_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for command, message in (
         ("picture antmaze-larg --out a.png", "did you mean 'antmaze-large'"),
         ("picture antmaze --out a.jpg", "written as .png"),
         ("picture antmaze", "--out"),
+        ("picture tests --out a.png", "tests"),  # a folder, but no run
+        ("picture tests --out a.jpg", "written as .png"),
     ):
         assert main(command) == 2
         lines = capsys.readouterr().err.strip().splitlines()
