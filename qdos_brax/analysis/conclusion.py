@@ -16,7 +16,7 @@ from qdos_brax.data import formats
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.errors import UserError
 from qdos_brax.runs.folder import RunFolder
-from qdos_brax.runs.hints import module_command
+from qdos_brax.runs.hints import module_command, train_command
 
 if TYPE_CHECKING:
     from qdos_brax.report.write import Report
@@ -50,7 +50,9 @@ def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[
         print(f"  {with_alpha(summary['method'], member['alpha'])}seed {member['seed']}: {_result(member)}")
     print(f"summary   {folder.summary}")
     _print_files(report)
-    print(f"evaluate  {module_command('evaluate', folder.path)}", flush=True)
+    print(f"evaluate  {module_command('evaluate', folder.path)}")
+    print(f"film      {module_command('evaluate', folder.path, '--video', 'episode.mp4')}")
+    print(f"compare   {train_command('--env', summary['env'], '--method', 'qdos,supe', '--seed', '0,1,2')}", flush=True)
 
 
 def _result(member: Mapping[str, Any]) -> str:

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 from qdos_brax import __version__
 from qdos_brax.commands.arguments import Parser, guarded, natural, parse, positive
@@ -25,86 +26,93 @@ def train_main(argv: Sequence[str] | None = None, prog: str = "python train.py")
         return guarded(lambda: _train(args, started))
 
 
+_EXAMPLES = """examples:
+  {prog} --env antsoccer --alpha 0.3
+  {prog} --env antmaze-large --alpha 0.1,0.3 --seed 0,1,2     # a scan
+  {prog} --env antmaze-medium --method qdos,supe --seed 0,1   # a comparison
+  {prog} --env antsoccer --preset smoke                       # does it run here?
+  {prog} --resume runs/mine"""
+_EPILOG = """--set takes any key of config.yaml; python -m qdos_brax config lists and explains them.
+Methods: docs/methods.md."""
+
+
 def train_parser(prog: str = "python train.py") -> Parser:
     """Return the parser of ``train.py``."""
     parser = Parser(
         prog=prog,
-        description="Collect or read data, pretrain skills, label the data, learn online, evaluate and report.",
-        epilog="Any key of config.yaml can be set with --set; python -m qdos_brax config lists and explains the keys.",
+        usage=f"{prog} --env TASK [options]",
+        description=_EXAMPLES.format(prog=prog),
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--env", metavar="TASK", help="the task, as listed by: python -m qdos_brax tasks")
-    for label, key in labelled().items():
-        meaning = get_field(key).metadata["meaning"]
-        parser.add_argument(f"--{label}", metavar="X[,X..]", help=f"{meaning}; several values make a scan")
-    parser.add_argument("--seed", metavar="S[,S..]", help="seed; several make a scan (default 0)")
-    methods = "; ".join(f"{name}: {method.summary}" for name, method in METHODS.items())
-    parser.add_argument(
-        "--method",
-        metavar="NAME[,NAME..]",
-        help=f"the method (default qdos); several are compared, one run after another. {methods}",
-    )
-    parser.add_argument(
-        "--preset",
-        metavar="NAME",
-        help=f"sizes of networks and budgets: {', '.join(presets())} (default cpu without an accelerator, else paper)",
-    )
-    parser.add_argument("--out", metavar="DIR", help="the folder of the run or comparison (default: under runs/)")
-    parser.add_argument(
-        "--resume",
-        metavar="DIR",
-        help="continue the run or comparison in DIR exactly where it stopped; takes no other flag but --dataset, which "
-        "names the same data in a new place",
-    )
-    parser.add_argument(
-        "--dataset",
-        metavar="FILE",
-        help="OGBench .npz, D4RL .hdf5, Minari folder, or the name of a public data set such as "
-        "antmaze-large-navigate-v0, which is downloaded (default: the task's own set, collected once)",
-    )
-    parser.add_argument(
-        "--physics",
-        metavar="ENGINE",
-        help="auto, mjx, mjx-warp or mujoco (default auto: MuJoCo C where the task has it)",
-    )
-    parser.add_argument("--steps", metavar="N", help="environment steps of the online phase")
-    parser.add_argument(
-        "--pretrain-steps", metavar="N", help="gradient steps of each part that is learned from the data alone"
-    )
-    parser.add_argument(
-        "--wandb", action="store_true", default=None, help="also log to Weights & Biases (extra: wandb)"
-    )
-    parser.add_argument("--zip", action="store_true", help="pair the lists of a scan instead of taking their product")
-    parser.add_argument(
-        "--sample",
-        metavar="N",
-        help="draw N settings at random, from lists and from values such as skills.alpha=loguniform(0.1,3) or "
-        "uniform(a,b), each with every seed",
-    )
-    parser.add_argument(
-        "--members-per-program",
-        metavar="N",
-        help="members of a scan that a device trains at once; the others take turns (default: chosen automatically "
-        "and printed)",
-    )
-    parser.add_argument(
-        "--set",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        help="any key of the configuration, such as skills.kl_weight=0.2, or 0.1,0.2 to scan it; sizes take lists too, "
-        "one program each (skills.horizon=4,20); may be repeated",
-    )
-    parser.add_argument(
-        "--distributed",
-        action="store_true",
-        help="share the members with other processes that run the same command on a common --out or --resume; they are "
-        "found by the variables of Slurm, Open MPI or Kubernetes, or by the three flags below",
-    )
-    parser.add_argument("--coordinator", metavar="HOST:PORT", help="address of the first process")
-    parser.add_argument("--processes", metavar="N", type=positive, help="number of processes")
-    parser.add_argument("--process-id", metavar="I", type=natural, help="number of this process, from 0")
+    _add_run(parser.add_argument_group("what is trained"))
+    _add_sizes(parser.add_argument_group("how much, and with what settings"))
+    _add_scan(parser.add_argument_group("scans: several values of --seed, --method or --set"))
+    _add_folder(parser.add_argument_group("the run's folder"))
+    _add_processes(parser.add_argument_group("several processes"))
     parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
     return parser
+
+
+def _add_run(group: Any) -> None:
+    group.add_argument("--env", metavar="TASK", help="a task: python -m qdos_brax tasks")
+    group.add_argument("--method", metavar="NAME[,..]", help=f"{', '.join(METHODS)} (default qdos)")
+    group.add_argument("--seed", metavar="S[,..]", help="default 0")
+    for label, key in labelled().items():
+        meaning = get_field(key).metadata["meaning"]
+        group.add_argument(f"--{label}", metavar="X[,..]", help=meaning)
+    group.add_argument(
+        "--dataset",
+        metavar="FILE",
+        help="OGBench .npz, D4RL .hdf5, a Minari folder, or a public set's name: antmaze-large-navigate-v0 (default: "
+        "the task's own set, collected once)",
+    )
+    group.add_argument("--physics", metavar="ENGINE", help="auto, mjx, mjx-warp or mujoco (default auto)")
+
+
+def _add_sizes(group: Any) -> None:
+    names = ", ".join(presets())
+    group.add_argument("--preset", metavar="NAME", help=f"{names} (default: cpu without an accelerator, else paper)")
+    group.add_argument("--steps", metavar="N", help="environment steps of the online phase")
+    group.add_argument("--pretrain-steps", metavar="N", help="gradient steps of each part learned from data")
+    group.add_argument(
+        "--set", metavar="KEY=VALUE", action="append", default=[], help="any key of the configuration; may be repeated"
+    )
+
+
+def _add_scan(group: Any) -> None:
+    group.add_argument("--zip", action="store_true", help="pair the lists instead of taking their product")
+    group.add_argument(
+        "--sample",
+        metavar="N",
+        help="draw N settings from the lists and from values such as skills.alpha=loguniform(0.1,3), with every seed",
+    )
+    group.add_argument(
+        "--members-per-program",
+        metavar="N",
+        help="members that a device trains at once, the others take turns (default: chosen and printed)",
+    )
+
+
+def _add_folder(group: Any) -> None:
+    group.add_argument("--out", metavar="DIR", help="of the run or comparison (default: a new one under runs/)")
+    group.add_argument(
+        "--resume",
+        metavar="DIR",
+        help="continue exactly where it stopped; no other flag but --dataset, if the data has moved",
+    )
+    group.add_argument("--wandb", action="store_true", default=None, help="also log to Weights & Biases (extra: wandb)")
+
+
+def _add_processes(group: Any) -> None:
+    group.add_argument(
+        "--distributed",
+        action="store_true",
+        help="share the members with processes that run the same command; found by Slurm, Open MPI, Kubernetes, or by:",
+    )
+    group.add_argument("--coordinator", metavar="HOST:PORT", help="address of the first process")
+    group.add_argument("--processes", metavar="N", type=positive, help="how many there are")
+    group.add_argument("--process-id", metavar="I", type=natural, help="number of this one, from 0")
 
 
 def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:

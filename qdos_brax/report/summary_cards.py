@@ -8,6 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from qdos_brax.report.elements import Card
+from qdos_brax.report.next_step import advise
+from qdos_brax.report.series import curves
 from qdos_brax.report.statistics import mean_curve, probability_of_improvement
 from qdos_brax.report.study import Member, Setting, Study
 
@@ -16,7 +18,7 @@ _ENOUGH_SEEDS = 5  # with fewer, the bootstrap's interval is far too narrow
 
 
 def summary_cards(study: Study) -> list[Card]:
-    """Return the answers: three for each task, and one on the time of all runs."""
+    """Return the answers: up to four for each task, and one on the time of all runs."""
     found = []
     for task in study.tasks:
         where = f", {task}" if len(study.tasks) > 1 else ""
@@ -46,7 +48,7 @@ def _task_cards(study: Study, task: str) -> list[Card]:
     order = rank_settings(study, task)
     if not order:
         return [Card("Best success", "-", "No member was evaluated.")]
-    return [_best_card(order), _confidence_card(order), _first_goal_card(study, task)]
+    return [_best_card(order), _confidence_card(order), _first_goal_card(study, task), *_next_cards(study, task, order)]
 
 
 def _best_card(order: list[tuple[Setting, list[float]]]) -> Card:
@@ -99,6 +101,15 @@ def _first_goal_card(study: Study, task: str) -> Card:
         return Card(title, "none", "No member reached the goal while it learned online.")
     _, mean, label, reached, seeds = min(found)
     return Card(title, label, f"{mean:,.0f} environment steps to the first goal, mean of {reached} of {seeds} seeds.")
+
+
+def _next_cards(study: Study, task: str, order: list[tuple[Setting, list[float]]]) -> list[Card]:
+    """Return what the curve of the best setting suggests; nothing of a method that only learned offline."""
+    for curve in curves(study, task, "eval/success"):
+        if curve.setting is order[0][0] and not curve.offline:
+            verdict, text = advise(curve.steps, curve.mean, task)
+            return [Card("How it went", verdict, text)]
+    return []
 
 
 def _wall_time_card(study: Study) -> Card:

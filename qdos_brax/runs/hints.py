@@ -13,9 +13,14 @@ def module_command(*arguments: str | Path) -> str:
     return f"python -m qdos_brax {shlex.join(map(str, arguments))}"
 
 
+def train_command(*arguments: str | Path) -> str:
+    """Return the command that trains with these arguments: ``train.py`` where there is one, else the module."""
+    return f"python {'train.py' if _CHECKOUT else '-m qdos_brax train'} {shlex.join(map(str, arguments))}"
+
+
 def resume_command(path: str | Path) -> str:
-    """Return the command that continues the run in ``path``: by ``train.py`` where there is one, else the module."""
-    return f"python {'train.py' if _CHECKOUT else '-m qdos_brax train'} {resume_flag(path)}"
+    """Return the command that continues the run in ``path``."""
+    return train_command("--resume", path)
 
 
 def resume_flag(path: str | Path) -> str:

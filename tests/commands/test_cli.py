@@ -33,6 +33,7 @@ def test_every_flag_of_the_contract_has_help(capsys: pytest.CaptureFixture[str])
         assert f"{flag} " in text
     for action in train_parser()._actions:
         assert action.help
+    assert text.index("examples:") < text.index("  --env TASK ") and len(text.splitlines()) < 60
 
 
 @pytest.mark.parametrize("call", ["train.train_parser()", "main.main_parser([])"])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from qdos_brax.commands import main as commands
+from qdos_brax.report.next_step import advise
 from qdos_brax.report.series import curves, scans, surfaces
 from qdos_brax.report.study import read_study
 from qdos_brax.report.summary_cards import summary_cards
@@ -143,19 +144,36 @@ def test_every_combination_of_two_makes_a_surface(tmp_path: Path) -> None:
 def test_summary_cards_by_hand(tmp_path: Path) -> None:
     q = write_run(tmp_path / "q", success=[0.9, 0.8, 1.0], first_goals=[10_000, 20_000, 30_000])
     s = write_run(tmp_path / "s", "supe", [0.2, 0.4, 0.3], first_goals=[5_000, None, None])
-    best, sure, fastest, time = summary_cards(read_study([q, s]))
+    best, sure, fastest, went, time = summary_cards(read_study([q, s]))
     assert best.value == "qdos" and "90 % (95 % interval of the mean: 80 to 100 %)" in best.text
     assert sure.value == "better than the next" and "probability 1.00" in sure.text and "too narrow" in sure.text
     # One seed of supe was faster, but two of its three never reached the goal.
     assert fastest.value == "qdos" and fastest.text.startswith("20,000 ") and "3 of 3" in fastest.text
+    assert went.value == "learned"
     assert time.value == "13.3 min" and time.text == "6 members: 2.2 min each, 45 % of it online."
     even = write_run(tmp_path / "e", "supe", [0.9, 0.8, 1.0])
-    best, sure, fastest, _ = summary_cards(read_study([q, even]))
+    best, sure, fastest, *_ = summary_cards(read_study([q, even]))
     assert "2 settings" in best.value and sure.value == "no clear difference"
     assert sure.text.startswith("No difference was found between qdos and supe (95 % interval of the probability")
     nothing = write_run(tmp_path / "n", success=[0.0])
-    best, sure, fastest, _ = summary_cards(read_study([nothing]))
+    best, sure, fastest, never, _ = summary_cards(read_study([nothing]))
     assert (best.value, fastest.value) == ("none", "none") and "nothing to compare" in sure.text
+    assert never.value == "never reached the goal" and "--steps 8000" in never.text
+
+
+@pytest.mark.parametrize(
+    ("success", "verdict", "says"),
+    [
+        ([0, 0, 0, 0], "never reached the goal", "data check"),
+        ([0, 0.2, 0.5, 0.95], "learned", "--method"),
+        ([0, 0.2, 0.5, 0.8], "still rising", "By 30 points in the last quarter: try --steps 800"),
+        ([0, 0.9, 0.8, 0.5], "fell back", "at 90 % before"),
+        ([0, 0.6, 0.6, 0.62], "levelled off", "benchmarks/skills.py"),
+    ],
+)
+def test_advice_by_hand(success: list[float], verdict: str, says: str) -> None:
+    found = advise(np.array([100.0, 200, 300, 400]), np.array(success), "antmaze-medium-task1")
+    assert found.verdict == verdict and says in found.text
 
 
 def test_a_reader_is_warned(tmp_path: Path) -> None:
