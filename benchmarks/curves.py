@@ -1,0 +1,69 @@
+"""Keep the learning curves of finished runs: ``python benchmarks/curves.py RUN [RUN ..] --out results/curves.csv``.
+
+One row per evaluation of a member: task, method, preset, view, alpha, seed, environment steps, success, steps
+of the first goal, minutes of the whole run, and the command. Rows of other runs that are in the file stay; rows of the
+same command are replaced.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+from pathlib import Path
+
+from qdos_brax.files import write_text
+from qdos_brax.report.study import Study, read_study
+
+COLUMNS = (
+    *("env", "method", "preset", "view", "alpha", "seed"),
+    *("env_steps", "eval_success", "first_goal_step", "minutes_of_the_run", "command"),
+)
+
+
+def rows_of(study: Study) -> list[dict[str, str]]:
+    """Return the rows of all runs of a study."""
+    found = []
+    for run in study.runs:
+        origin = json.loads((run.path / "run.json").read_text(encoding="utf-8"))
+        words = origin["command"]
+        kept = [word for k, word in enumerate(words) if word != "--out" and words[k - 1] != "--out"]
+        about = {
+            "preset": str(run.summary["preset"]),
+            "view": run.config.skills.view,
+            "minutes_of_the_run": f"{run.summary['wall_seconds']['total'] / 60:.1f}",
+            "command": " ".join(["python", "train.py", *kept[1:]]),
+        }
+        for member in run.members:
+            goal = "" if member.first_goal != member.first_goal else f"{member.first_goal:.0f}"
+            own = {"env": member.task, "method": member.method, "seed": str(member.seed), "first_goal_step": goal}
+            own["alpha"] = str(member.values.get("skills.alpha", ""))
+            for row in member.rows:
+                if row.get("eval/success"):
+                    success = f"{float(row['eval/success']):.3g}"
+                    found.append(about | own | {"env_steps": row["env_steps"], "eval_success": success})
+    return found
+
+
+def main() -> None:
+    """Run the script from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="folders of finished runs")
+    parser.add_argument("--out", type=Path, required=True, help="CSV file")
+    args = parser.parse_args()
+    new = rows_of(read_study(args.runs))
+    known: list[dict[str, str]] = []
+    if args.out.exists():
+        with args.out.open(encoding="utf-8", newline="") as file:
+            known = [row for row in csv.DictReader(file) if row["command"] not in {row["command"] for row in new}]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows([*known, *new])
+    write_text(args.out, text.getvalue())
+    print(f"{len(new)} rows of {len(args.runs)} runs in {args.out}")
+
+
+if __name__ == "__main__":
+    main()

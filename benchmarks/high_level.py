@@ -1,0 +1,105 @@
+"""Train the high level anew on a run's skills: ``python benchmarks/high_level.py RUN --set KEY=VALUE --out FILE``.
+
+A setting of the high level is compared with another one on the same skills and labels, without learning those again:
+the phases after the skills run with the run's configuration and the ``--set`` of the command line. Prints each
+evaluation; the CSV gets one row per member and evaluation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from qdos_brax import config as configs
+from qdos_brax.analysis.conclusion import read_finished
+from qdos_brax.config import schema
+from qdos_brax.methods.build import bind_phases, build_context, build_phases
+from qdos_brax.population.members import Population
+from qdos_brax.runs.folder import RunFolder
+from qdos_brax.runs.jax_setup import prepare_jax
+
+COLUMNS = ("env", "method", "settings", "seed", "env_steps", "eval_success", "first_goal_step", "seconds")
+AFTER_SKILLS = ("label", "online")
+
+
+def changed(config: Any, settings: list[str]) -> Any:
+    """Return the configuration with KEY=VALUE settings."""
+    values = {}
+    for text in settings:
+        key, _, value = text.partition("=")
+        kind = type(schema.get(config, key))
+        values[key] = tuple(map(int, value.split(","))) if kind is tuple else kind(value)
+    return configs.replace(config, **values)
+
+
+def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, Any]]:
+    """Return a row per member and evaluation."""
+    trained, dataset = read_finished(RunFolder.open(str(run)))
+    config = changed(trained.config, settings)
+    everyone = configs.members(config)
+    chosen = [everyone[member] for member in members or range(len(everyone))]
+    context = build_context(config, trained.env, dataset)
+    phases = [phase for phase in build_phases(context) if phase.name in AFTER_SKILLS]
+    bind_phases(phases, Population(configs.population_hyper(config, chosen), 1, jax.local_devices()), context.data)
+    kept = {name: value for name, value in trained.artifacts.items() if name not in ("actor", "normaliser")}
+    artifacts = jax.tree.map(lambda x: x[np.asarray(members or range(len(everyone)))], kept)
+    seeds = np.asarray([member["seed"] for member in chosen], np.uint32)
+    rows, began = [], time.perf_counter()
+    for index, phase in enumerate(phases):
+        keys = jax.vmap(lambda seed, index=index: jax.random.fold_in(jax.random.key(seed), 100 + index))(seeds)
+        state, constants = phase.init(keys, artifacts)
+        for _ in range(phase.num_chunks):
+            state, info = phase.chunk(state, constants)
+            if "eval/success" in info:
+                new = _rows(config, chosen, settings, info, time.perf_counter() - began)
+                print(f"{new[0]['env_steps']} steps: {', '.join(row['eval_success'] for row in new)}", flush=True)
+                rows += new
+        artifacts = phase.finish(state, artifacts)
+    return rows
+
+
+def _rows(config: Any, members: list[Any], settings: list[str], info: Any, seconds: float) -> list[dict[str, Any]]:
+    return [
+        {
+            "env": config.env,
+            "method": config.method,
+            "settings": " ".join(settings),
+            "seed": member["seed"],
+            "env_steps": int(info["env_steps"][k]),
+            "eval_success": f"{float(info['eval/success'][k]):.3g}",
+            "first_goal_step": f"{float(info['first_goal_step'][k]):.0f}".replace("nan", ""),
+            "seconds": f"{seconds:.0f}",
+        }
+        for k, member in enumerate(members)
+    ]
+
+
+def main() -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished run")
+    parser.add_argument(
+        "--members", type=int, nargs="+", default=[], help="numbers of the run's members (default: all)"
+    )
+    parser.add_argument("--set", metavar="KEY=VALUE", nargs="+", default=[], dest="settings", help="changed settings")
+    parser.add_argument("--out", type=Path, help="CSV file to add the rows to")
+    args = parser.parse_args()
+    prepare_jax()
+    rows = train(args.run, args.members, args.settings)
+    if args.out:
+        fresh = not args.out.exists()
+        with args.out.open("a", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            if fresh:
+                writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
