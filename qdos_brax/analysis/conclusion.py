@@ -26,7 +26,8 @@ _AT_THE_END = ("qdos_brax.report.write", "qdos_brax.analysis.inside")
 
 def load_beside() -> None:
     """Load Matplotlib, SciPy's statistics and scikit-learn on a thread, while the run trains: 1.5 s for its end."""
-    threading.Thread(target=lambda: [importlib.import_module(name) for name in _AT_THE_END], daemon=True).start()
+    # No daemon: a process that ends early waits for it, since a thread that is killed within a C++ library aborts.
+    threading.Thread(target=lambda: [importlib.import_module(name) for name in _AT_THE_END]).start()
 
 
 def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[], tuple[TrainedRun, Dataset]]) -> None:
