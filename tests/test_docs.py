@@ -67,3 +67,9 @@ def test_readme_is_short_and_has_two_commands_that_set_up() -> None:
 def test_every_page_is_linked_from_the_readme() -> None:
     linked = {link.partition("#")[0] for link in LINK.findall((ROOT / "README.md").read_text(encoding="utf-8"))}
     assert {str(page.relative_to(ROOT)) for page in PAGES[1:]} <= linked
+
+
+def test_every_result_names_its_command() -> None:
+    text = (ROOT / "results" / "README.md").read_text(encoding="utf-8")
+    names = [path.name + ("/" if path.is_dir() else "") for path in (ROOT / "results").iterdir()]
+    assert [name for name in names if name != "README.md" and f"`{name}`" not in text] == []
