@@ -6,7 +6,7 @@ import os
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -114,11 +114,25 @@ class BatchStepper:
         try:
             batch = self._idle[n].pop()
         except IndexError:
-            batch = Batch(self._model, nsim=n, nthread=min(self._threads, n))
+            batch = _ViewKeepingBatch(self._model, nsim=n, nthread=min(self._threads, n))
             for name in self._rig.fields:  # a field is filled from the first call after it was bound
                 batch.bind(name)
         yield batch
         self._idle[n].append(batch)
+
+
+class _ViewKeepingBatch(Batch):
+    """Keep every view that was asked for: ``Batch`` makes those of state fields anew at each call, six a step."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._views: dict[str, np.ndarray] = {}
+
+    def bind(self, name: str) -> np.ndarray:
+        """Return the live array of a field."""
+        if name not in self._views:
+            self._views[name] = super().bind(name)
+        return self._views[name]
 
 
 def with_changes(exact: np.ndarray, values: np.ndarray) -> np.ndarray:
