@@ -200,7 +200,7 @@ def _copy(response: Any, file: Any, done: int, total: int | None, name: str) -> 
             done += len(piece)
             while pieces and shown < (pieces if done == total else done // _PIECE):
                 shown += 1
-                progress.advance((done - first) / 1e6 / max(1e-3, time.monotonic() - began), "MB", float("nan"))
+                progress.advance((done - first) / 1e6 / max(1e-3, time.monotonic() - began), "MB")
     file.truncate()
     if total is not None and done < total:
         raise _TryAgain(f"truncated at {done:,} of {total:,} bytes")

@@ -176,9 +176,8 @@ class _Runner:
         unit = "env_steps" if done.get("env_steps") else "update"
         rate = done.get(unit, 0.0) / seconds
         self.table.append(phase.name, metrics, rate)
-        progress.advance(
-            rate, "env steps" if unit == "env_steps" else "updates", _mean(self.table.latest("eval/success"))
-        )
+        success, episode_return = (_mean(self.table.latest(f"eval/{name}")) for name in ("success", "return"))
+        progress.advance(rate, "env steps" if unit == "env_steps" else "updates", success, episode_return)
         return state
 
     def _save(self, phase: int, chunk: int, state: Any | None) -> float:

@@ -16,7 +16,7 @@ _QUIET_SECONDS = 10.0
 
 
 class Progress:
-    """Show the progress of a phase or another long work: its name, rate, time left, latest success.
+    """Show the progress of a phase or another long work: its name, rate, time left, latest success and return.
 
     Args:
         phase: name of the work.
@@ -64,15 +64,17 @@ class Progress:
             self._live.update(self._bar)  # only the bar stays
             self._live.stop()
 
-    def advance(self, rate: float, unit: str, success: float) -> None:
+    def advance(self, rate: float, unit: str, success: float = math.nan, episode_return: float = math.nan) -> None:
         """Show that one more chunk is done.
 
         Args:
             rate: steps per second in it.
             unit: name of a step ("updates", "env steps").
-            success: mean latest success of the members, 0 to 1; nan if none was measured.
+            success: mean success of the members at their latest evaluation, 0 to 1; nan if there was none.
+            episode_return: mean return there.
         """
-        note = f"{rate:,.0f} {unit}/s" + ("" if math.isnan(success) else f", success {success:.2f}")
+        found = "" if math.isnan(success) else f", success {success:.2f}, return {episode_return:.0f}"
+        note = f"{rate:,.0f} {unit}/s{found}"
         self._show(self._done + 1, note)
 
     def advance_to(self, done: int, unit: str) -> None:

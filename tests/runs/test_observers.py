@@ -175,7 +175,7 @@ def test_terminal_shows_a_table_of_members_and_leaves_a_line(
         metrics = {"env_steps": 100, "eval/success": [0.25, 0.5, 0], "eval/return": [-90, -50, -100]}
         goal = [math.nan, 1234, math.nan]
         table.append("online", {**metrics, "critic_loss": 1.5, "first_goal_step": goal, "status_ok": [1, 1, 0]}, 10)
-        progress.advance(10.0, "env steps", 0.25)
+        progress.advance(10.0, "env steps", 0.25, -80.0)
     text = terminal.getvalue()
     header = next(line for line in text.splitlines() if "first goal" in line)
     assert [word for word in ("seed", "alpha", "success", "return", "loss") if word not in header] == []
@@ -183,7 +183,7 @@ def test_terminal_shows_a_table_of_members_and_leaves_a_line(
     assert any(line.split()[-6:] == ["0.2", "0.5", "-50", "1,234", "1.5", "(critic)"] for line in text.splitlines()), (
         text
     )
-    assert "frozen" in text and "10 env steps/s, success 0.25" in text
+    assert "frozen" in text and "10 env steps/s, success 0.25, return -80" in text
     assert "first goal" not in text.rsplit("online", 1)[1]  # of the phase only the line stays
 
 
@@ -191,7 +191,7 @@ def test_elsewhere_it_is_quiet(board: tuple[MemberBoard, MetricsTable]) -> None:
     stream = io.StringIO()
     with Progress("online", 3, stream=stream, below=board[0]) as progress:
         for _ in range(3):
-            progress.advance(10.0, "env steps", math.nan)
+            progress.advance(10.0, "env steps")
     (line,) = stream.getvalue().splitlines()
     assert line.startswith("online 100%") and line.endswith("10 env steps/s")
 
