@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import fnmatch
+import importlib
 import tomllib
 from pathlib import Path
 
 import pytest
+
+from qdos_brax.commands.main import main
 
 ROOT = Path(__file__).parents[1]
 SETUPTOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
@@ -27,3 +30,10 @@ def data_files() -> list[Path]:
 def test_the_wheel_holds(path: Path) -> None:
     patterns = SETUPTOOLS["package-data"].get(".".join(path.parent.parts), [])
     assert any(fnmatch.fnmatch(path.name, pattern) for pattern in patterns)
+
+
+@pytest.mark.quick
+def test_the_console_command_is_there() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    module, _, function = project["scripts"]["qdos"].partition(":")
+    assert getattr(importlib.import_module(module), function) is main
