@@ -18,7 +18,6 @@ import numpy as np
 
 from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import read_finished
-from qdos_brax.config import schema
 from qdos_brax.methods.build import bind_phases, build_context, build_phases
 from qdos_brax.population.members import Population
 from qdos_brax.runs.folder import RunFolder
@@ -28,27 +27,18 @@ COLUMNS = ("env", "method", "settings", "seed", "env_steps", "eval_success", "fi
 AFTER_SKILLS = ("label", "online")
 
 
-def changed(config: Any, settings: list[str]) -> Any:
-    """Return the configuration with KEY=VALUE settings."""
-    values = {}
-    for text in settings:
-        key, _, value = text.partition("=")
-        kind = type(schema.get(config, key))
-        values[key] = tuple(map(int, value.split(","))) if kind is tuple else kind(value)
-    return configs.replace(config, **values)
-
-
 def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, Any]]:
     """Return a row per member and evaluation."""
     trained, dataset = read_finished(RunFolder.open(str(run)))
-    config = changed(trained.config, settings)
+    config = configs.replace(trained.config, **dict(text.split("=", 1) for text in settings))
     everyone = configs.members(config)
-    chosen = [everyone[member] for member in members or range(len(everyone))]
+    members = members or list(range(len(everyone)))
+    chosen = [everyone[member] for member in members]
     context = build_context(config, trained.env, dataset)
     phases = [phase for phase in build_phases(context) if phase.name in AFTER_SKILLS]
     bind_phases(phases, Population(configs.population_hyper(config, chosen), 1, jax.local_devices()), context.data)
     kept = {name: value for name, value in trained.artifacts.items() if name not in ("actor", "normaliser")}
-    artifacts = jax.tree.map(lambda x: x[np.asarray(members or range(len(everyone)))], kept)
+    artifacts = jax.tree.map(lambda x: x[np.asarray(members)], kept)
     seeds = np.asarray([member["seed"] for member in chosen], np.uint32)
     rows, began = [], time.perf_counter()
     for index, phase in enumerate(phases):

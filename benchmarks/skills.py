@@ -24,11 +24,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import envs
 from envs.mazes.maze import UNIT
 from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import read_finished
-from qdos_brax.analysis.film import of_member
+from qdos_brax.analysis.film import of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.runs.folder import RunFolder
@@ -152,7 +151,7 @@ def oracle(skills: Skills, episodes: int) -> dict[str, float]:
 def measure(run: Path, draws: int, states: int, episodes: int) -> list[dict[str, Any]]:
     """Return one row per member of a finished run."""
     trained, dataset = read_finished(RunFolder.open(run))
-    trained = trained._replace(env=envs.make(trained.config.env, physics="mujoco"))
+    trained = on_mujoco_c(trained)
     rows = []
     for member, settings in enumerate(configs.members(trained.config)):
         started = time.perf_counter()

@@ -12,10 +12,9 @@ import numpy as np
 from sklearn.manifold import TSNE  # type: ignore[import-untyped]
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-import envs
 from envs.render import NoOpenGL, Renderer
 from qdos_brax import config as configs
-from qdos_brax.analysis.film import EpisodeRunner, of_member
+from qdos_brax.analysis.film import EpisodeRunner, evenly_spaced, of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun, evaluation_key
 from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
@@ -67,8 +66,7 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    # On MuJoCo C whatever the run was on: a few episodes are not worth MJX's compilation.
-    trained = trained._replace(env=envs.make(trained.config.env, physics="mujoco"))
+    trained = on_mujoco_c(trained)
     sample = _sample(trained, dataset)
     members = _first_seeds(trained)
     arrays: Arrays = {"members": np.asarray(members), **_place(trained.env), **_truth(trained, sample)}
@@ -253,7 +251,7 @@ def _episode(trained: TrainedRun, runner: EpisodeRunner, member: int) -> Arrays:
         found["left"] = np.asarray(left, np.float32)
     if trained.env.floor_map() is not None:
         found["path"] = _place_of_body(trained.env, qpos).astype(np.float32)
-    steps = np.unique(np.linspace(0, len(states) - 1, _FRAMES).round().astype(int))
+    steps = evenly_spaced(_FRAMES, len(states))
     try:
         with Renderer(trained.env, _FRAME_HEIGHT) as renderer:
             found["frames"] = np.stack([renderer.frame(*states[step][:2]) for step in steps])

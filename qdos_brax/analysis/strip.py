@@ -10,9 +10,8 @@ matplotlib.use("Agg")  # no display is needed to write a file
 import matplotlib.pyplot as plt
 import numpy as np
 
-import envs
 from envs.render import NoOpenGL, Renderer, steps_per_second
-from qdos_brax.analysis.film import EpisodeRunner
+from qdos_brax.analysis.film import EpisodeRunner, evenly_spaced, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun, load_run
 from qdos_brax.errors import UserError
 from qdos_brax.report.curves import save_figure
@@ -54,15 +53,14 @@ def draw_run(run: Path, out: Path) -> None:
 
 def _frames(trained: TrainedRun) -> list[tuple[float, np.ndarray]]:
     """Return (seconds, image) of some of the episode's states, evenly spaced from its start to its end."""
-    env = envs.make(trained.config.env, physics="mujoco")  # an episode is not worth MJX's compilation
-    episode = EpisodeRunner(trained._replace(env=env)).episode(0)
+    trained = on_mujoco_c(trained)
+    env, episode = trained.env, EpisodeRunner(trained).episode(0)
     states = [(np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal"])) for state, _ in episode]
-    chosen = np.unique(np.linspace(0, len(states) - 1, _FRAMES).round().astype(int))
     rate = steps_per_second(env)
     camera = _CAMERA if _CAMERA in env.scene().cameras else None
     try:
         with Renderer(env, _HEIGHT, _HEIGHT, camera) as renderer:
-            return [(step / rate, renderer.frame(*states[step])) for step in chosen]
+            return [(step / rate, renderer.frame(*states[step])) for step in evenly_spaced(_FRAMES, len(states))]
     except NoOpenGL as error:
         raise UserError(str(error)) from error
 

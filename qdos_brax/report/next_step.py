@@ -27,11 +27,8 @@ def advise(steps: np.ndarray, success: np.ndarray, task: str) -> Advice:
         success: float[points], 0 to 1, the mean over the seeds.
         task: the task's full name.
     """
-    last, best, earlier = (
-        float(success[-1]),
-        float(success.max()),
-        float(np.interp(_LAST_PART * steps[-1], steps, success)),
-    )
+    last, best = float(success[-1]), float(success.max())
+    earlier = float(np.interp(_LAST_PART * steps[-1], steps, success))
     longer = f"--steps {2 * round(float(steps[-1])):d}"
     if best == 0:
         return Advice(

@@ -12,6 +12,7 @@
 #   ppo: AttributeError, jax.device_put_replicated is deprecated; use jax.device_put instead.
 #   sac: AttributeError, jax.device_put_replicated is deprecated; use jax.device_put instead.
 set -euo pipefail
+unset PYTHONPATH
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 python3 -m venv "$work/venv"
@@ -19,11 +20,11 @@ python3 -m venv "$work/venv"
 "$work/venv/bin/pip" check
 "$work/venv/bin/python" - <<'PY' 2> "$work/errors" || { cat "$work/errors"; exit 1; }
 import jax
-from brax import envs
+from brax.envs import get_environment
 from brax.training.agents.ppo import train as ppo
 from brax.training.agents.sac import train as sac
 
-env = envs.get_environment("fast")
+env = get_environment("fast")
 state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.PRNGKey(0)), jax.numpy.zeros(env.action_size))
 print("environment: ok", flush=True)
 few = {"num_timesteps": 128, "episode_length": 64, "num_envs": 8, "num_evals": 1}
