@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import rankdata
 
 from envs.task import Task
 from qdos_brax.data.dataset import Dataset
@@ -48,6 +47,8 @@ def auc(scores: np.ndarray, positive: np.ndarray) -> float:
         scores: float[S].
         positive: bool[S].
     """
+    from scipy.stats import rankdata  # here, for training reads this module and loading this one takes long
+
     scores, positive = np.asarray(scores, np.float64), np.asarray(positive, bool)
     num_positive = int(positive.sum())
     num_negative = len(positive) - num_positive
