@@ -127,7 +127,12 @@ def check_method(config: Config) -> None:
         raise UserError(f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({horizon})")
 
 
-_AS_BEFORE = {("skills", "view"): "world", ("high_level", "actor_updates"): 1}
+_AS_BEFORE = {
+    ("skills", "view"): "world",
+    ("high_level", "actor_updates"): 1,
+    ("labels", "latent"): "sample",
+    ("labels", "inputs"): "normalised",
+}
 
 
 def config_hash(config: Config) -> str:

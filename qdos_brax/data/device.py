@@ -26,6 +26,10 @@ class Normaliser(struct.PyTreeNode):
         """Return ``observation[..., obs]`` normalised."""
         return (observation - self.mean) / self.scale
 
+    def restored(self, observation: jax.Array) -> jax.Array:
+        """Return normalised ``observation[..., obs]`` in the task's own units."""
+        return observation * self.scale + self.mean
+
     def repeated(self, members: int) -> dict[str, jax.Array]:
         """Return its fields, with a leading axis of ``members`` copies."""
         fields = {"mean": self.mean, "scale": self.scale}

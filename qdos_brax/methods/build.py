@@ -104,14 +104,18 @@ def build_phases(context: BuildContext) -> list[MemberPhase]:
     return [
         *_LOW_LEVEL[method.low_level].phases(context),
         *([] if guide is None else [_offline_phase(context, "guide", guide.learner, config.guide.updates)]),
-        *([LabelPhase(config.skills.horizon, len(context.data.starts), low_level)] if labelled else []),
+        *(
+            [LabelPhase(config.skills.horizon, len(context.data.starts), low_level, config.labels.latent)]
+            if labelled
+            else []
+        ),
         OnlinePhase(
             config,
             env,
             context.normaliser,
             low_level,
             _labeller(context, low_level),
-            _bonus(config, env, low_level),
+            _bonus(context, low_level),
             None if guide is None else guide.jump_start,
         ),
     ]
@@ -296,12 +300,19 @@ def _labeller(context: BuildContext, low_level: LowLevelPolicy) -> OfflineReward
         return DataReward()
     model = RewardModel(context.env.observation_size + low_level.width, labels.reward_hidden)
     if labels.offline_reward == "pred":
-        return PredictedReward(model)
-    return MinimumReward(model, context.config.skills.horizon, float(context.dataset.rewards.min()))
+        return PredictedReward(model, _shown_to_labels(context))
+    lowest = float(context.dataset.rewards.min())
+    return MinimumReward(model, _shown_to_labels(context), context.config.skills.horizon, lowest)
 
 
-def _bonus(config: Config, env: SpaceSizes, low_level: LowLevelPolicy) -> Bonus:
-    labels = config.labels
+def _bonus(context: BuildContext, low_level: LowLevelPolicy) -> Bonus:
+    labels = context.config.labels
     if labels.rnd_coefficient == 0:
         return NoBonus()
-    return RNDBonus(RND(env.observation_size + low_level.width, labels.rnd_hidden, labels.rnd_features))
+    rnd = RND(context.env.observation_size + low_level.width, labels.rnd_hidden, labels.rnd_features)
+    return RNDBonus(rnd, _shown_to_labels(context))
+
+
+def _shown_to_labels(context: BuildContext) -> Callable[[jax.Array], jax.Array]:
+    """Return what makes of normalised observations what bonus and reward model see."""
+    return context.normaliser.restored if context.config.labels.inputs == "raw" else lambda observation: observation
