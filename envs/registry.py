@@ -8,6 +8,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from envs.families import Family, TaskSpec
+from envs.manipulation.families import MANIPULATION_FAMILIES
 from envs.mazes.families import MAZE_FAMILIES
 
 if TYPE_CHECKING:
@@ -98,5 +99,5 @@ def _load(make: Any) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-for _name, _family in MAZE_FAMILIES.items():
+for _name, _family in (MAZE_FAMILIES | MANIPULATION_FAMILIES).items():
     register_family(_name, _family)

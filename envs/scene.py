@@ -53,6 +53,11 @@ def following_view(body: int, azimuth: float = 90.0, elevation: float = -50.0, d
     return partial(_following_camera, body, azimuth, elevation, distance)
 
 
+def fixed_view(lookat: Sequence[float], azimuth: float, elevation: float, distance: float) -> View:
+    """Return a view of the point ``lookat`` (x, y, z) from a place of its own; angles in degrees, distance in m."""
+    return partial(_fixed_camera, tuple(lookat), azimuth, elevation, distance)
+
+
 def _top_camera(
     centre: tuple[float, ...], half_size: tuple[float, ...], height: float, model: mujoco.MjModel, aspect: float
 ) -> mujoco.MjvCamera:
@@ -61,6 +66,20 @@ def _top_camera(
     camera.lookat[:] = (*centre, 0.0)
     camera.azimuth, camera.elevation = 90.0, -90.0
     camera.distance = max(half_y, half_x / aspect) / math.tan(math.radians(fovy) / 2) + height
+    return camera
+
+
+def _fixed_camera(
+    lookat: tuple[float, ...],
+    azimuth: float,
+    elevation: float,
+    distance: float,
+    model: mujoco.MjModel,
+    aspect: float,
+) -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = lookat
+    camera.azimuth, camera.elevation, camera.distance = azimuth, elevation, distance
     return camera
 
 

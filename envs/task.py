@@ -165,7 +165,7 @@ class Task(Env, ABC):
             key: what the physics' chances, and ``AutoReset`` for the next episode, draw from; None takes a fixed one.
             extra: int[e], the discrete state; None takes zeros.
         """
-        pipeline_state = self.engine.init(qpos, qvel, extra)
+        pipeline_state = self.engine.init(qpos, qvel, extra, key)
         obs = self.observe(pipeline_state)
         info = {
             "goal": jnp.asarray(self._goal if goal is None else goal, jnp.float32),

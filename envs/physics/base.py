@@ -94,8 +94,13 @@ class Engine(Protocol):
     action_size: int
     extra_size: int
 
-    def init(self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None) -> PipelineState:
-        """Return the state at (qpos[nq], qvel[nv], extra[e]), with no warm start; None takes zeros as ``extra``."""
+    def init(
+        self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None, key: jax.Array | None = None
+    ) -> PipelineState:
+        """Return the state at (qpos[nq], qvel[nv], extra[e]), with no warm start; None takes zeros as ``extra``.
+
+        Sensors that err draw their errors from ``key``; None takes a fixed one.
+        """
         ...
 
     def step(self, state: PipelineState, action: jax.Array) -> PipelineState:

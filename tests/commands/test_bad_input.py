@@ -28,7 +28,7 @@ TRAIN = [
     "--env",
     "--env antmaze-huge --preset smoke",
     "--env nosuch --preset smoke",
-    "--env kitchen --preset smoke --out {new}",
+    "--env kitchen-huge --preset smoke --out {new}",
     "--env cube-single",
     "--env antmaze-medium-task9 --preset smoke --out {new}",
     "--env antmaze-medium --preset nosuch",

@@ -71,8 +71,10 @@ class MjxEngine:
         self._data = mjx.make_data(model, impl="jax")
         self._constraints = Constraints(model, self._mjx_model, most_contacts)
 
-    def init(self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None) -> PipelineState:
-        """Return the state at (qpos[nq], qvel[nv]) without warm start; there is no ``extra`` on this engine."""
+    def init(
+        self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None = None, key: jax.Array | None = None
+    ) -> PipelineState:
+        """Return the state at (qpos[nq], qvel[nv]) without warm start; there are no ``extra`` and no chances here."""
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         sensed, none = self._sense(qpos, qvel), jnp.zeros(0, jnp.int32)
         return PipelineState(qpos, qvel, sensed, none, jnp.zeros_like(qvel), jnp.zeros((), jnp.int32))

@@ -18,6 +18,9 @@ class Rig:
         memory_size: float64 numbers that the rig carries from one control step to the next.
         extra_size: numbers of the discrete state ``PipelineState.extra``.
         sensed_size: float32 numbers that the task observes besides qpos and qvel.
+        noise_size: numbers, uniform in [-1, 1), that jax draws for every state, for sensors that err.
+        exact_qpos: float64[nq], where a task starts: a fresh state that is its rounding to float32 stands for it. None:
+            there is no such place.
         fields: fields of MjData that ``start`` and ``after`` read with ``batch.bind``.
         stage: how far the forward pass after the last sub-step goes (``mujoco.mjtStage``), for these fields.
     """
@@ -26,6 +29,8 @@ class Rig:
     memory_size: int = 0
     extra_size: int = 0
     sensed_size: int = 0
+    noise_size: int = 0
+    exact_qpos: np.ndarray | None = None
     fields: tuple[str, ...] = ()
     stage: mujoco.mjtStage = mujoco.mjtStage.mjSTAGE_NONE
 
@@ -72,3 +77,15 @@ class Rig:
             extra: int32[n, e], before it.
         """
         return memory, extra, np.zeros((batch.nsim, self.sensed_size), np.float32)
+
+    def disturb(self, memory: np.ndarray, sensed: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (memory, sensed) of ``start`` and ``after`` with the errors of the sensors.
+
+        It is called only if ``noise_size`` is not 0, and may be given ``sensed`` in float64, as those returned it.
+
+        Args:
+            memory: float64[n, m].
+            sensed: [n, k].
+            noise: float32[n, noise_size].
+        """
+        return memory, sensed

@@ -15,6 +15,7 @@ from mujoco.batch import Batch
 from envs.physics.mujoco.rig import Rig
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_TINY = float(np.finfo(np.float32).tiny)  # XLA takes float32 numbers below it for 0
 
 
 class BatchStep(NamedTuple):
@@ -48,6 +49,7 @@ class BatchStepper:
         self._velocities = slice(1 + model.nq, 1 + model.nq + model.nv)
         self._threads = threads or len(os.sched_getaffinity(0))
         self._rest = _rest_row(model)
+        self._exact_qpos = rig.exact_qpos
         self._idle: dict[int, list[Batch]] = defaultdict(list)
 
     def identity(self) -> bytes:
@@ -56,14 +58,23 @@ class BatchStepper:
         mujoco.mj_saveModel(self._model, None, content)
         return content.tobytes() + repr((mujoco.__version__, self._frame_skip, self._threads)).encode()
 
-    def start(self, qpos: np.ndarray, qvel: np.ndarray, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rig's (memory float64[n, m], sensed float32[n, k]) at rest rows with (qpos, qvel, extra)."""
+    def start(
+        self, qpos: np.ndarray, qvel: np.ndarray, extra: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rig's (memory float64[n, m], sensed float32[n, k]) at rest rows with (qpos, qvel, extra).
+
+        Args:
+            qpos: float32[n, nq].
+            qvel: float32[n, nv].
+            extra: int32[n, e].
+            noise: float32[n, rig.noise_size].
+        """
         with self._batch(len(qpos)) as batch:
             batch.state[:] = self._rest
-            batch.bind("qpos")[:] = qpos
+            batch.bind("qpos")[:] = self._fresh_qpos(qpos)
             batch.bind("qvel")[:] = qvel
             batch.forward(stage=int(self._rig.stage))
-            return self._rig.start(batch, extra)
+            return self._disturbed(*self._rig.start(batch, extra), noise)
 
     def step(
         self,
@@ -73,6 +84,7 @@ class BatchStepper:
         qvel: np.ndarray,
         extra: np.ndarray,
         action: np.ndarray,
+        noise: np.ndarray,
     ) -> BatchStep:
         """Return n simulations after one control step.
 
@@ -84,14 +96,15 @@ class BatchStepper:
             qvel: float32[n, nv], likewise.
             extra: int32[n, e].
             action: float32[n, act].
+            noise: float32[n, rig.noise_size].
         """
         rig, memory = self._rig, exact[:, self.nstate :]
         with self._batch(len(exact)) as batch:
             np.copyto(batch.state, exact[:, : self.nstate])
             batch.state[fresh] = self._rest
-            for name, values in (("qpos", qpos), ("qvel", qvel)):
+            for name, start, values in (("qpos", self._fresh_qpos(qpos), qpos), ("qvel", qvel, qvel)):
                 held = batch.bind(name)
-                held[:] = np.where(fresh[:, None], values, with_changes(held, values))
+                held[:] = np.where(fresh[:, None], start, with_changes(held, values))
             # A state that is not finite stays as it is, for the task to see; MuJoCo would spend long on it.
             sound = np.isfinite(batch.state).all(axis=1)
             rig.before(batch, extra)
@@ -100,9 +113,23 @@ class BatchStepper:
             ids = None if sound.all() else np.flatnonzero(sound)
             batch.step(ids=ids, nstep=self._frame_skip, stage=int(rig.stage))
             rows = np.empty_like(exact)
-            rows[:, self.nstate :], extra, sensed = rig.after(batch, qpos_before, memory, extra)
+            memory, extra, sensed = rig.after(batch, qpos_before, memory, extra)
+            rows[:, self.nstate :], sensed = self._disturbed(memory, sensed, noise)
             rows[:, : self.nstate] = batch.state
         return BatchStep(rows, extra, sensed)
+
+    def _fresh_qpos(self, qpos: np.ndarray) -> np.ndarray:
+        """Return the float64[n, nq] that fresh states at ``qpos`` (float32[n, nq]) start from."""
+        if self._exact_qpos is None:
+            return qpos.astype(np.float64)
+        there = (self._exact_qpos.astype(np.float32) == qpos).all(axis=1, keepdims=True)
+        return np.where(there, self._exact_qpos, qpos)
+
+    def _disturbed(self, memory: np.ndarray, sensed: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (memory, sensed float32[n, k]) as sensors with errors have them."""
+        if self._rig.noise_size:
+            memory, sensed = self._rig.disturb(memory, sensed, noise)
+        return memory, sensed.astype(np.float32, copy=False)
 
     def positions(self, exact: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the float64 views (qpos[..., nq], qvel[..., nv]) of ``exact[..., nstate + m]``."""
@@ -136,8 +163,12 @@ class _ViewKeepingBatch(Batch):
 
 
 def with_changes(exact: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return ``exact`` (float64), but ``values`` (float32) where they are not its rounding."""
-    return np.where(exact.astype(np.float32) == values, exact, values)
+    """Return ``exact`` (float64), but ``values`` (float32) where they are not its rounding.
+
+    A 0 may be what compiled programs made of a number that is too small for them.
+    """
+    same = (exact.astype(np.float32) == values) | ((values == 0) & (np.abs(exact) < _TINY))
+    return np.where(same, exact, values)
 
 
 def _rest_row(model: mujoco.MjModel) -> np.ndarray:

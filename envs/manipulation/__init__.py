@@ -1,0 +1,1 @@
+"""Manipulation tasks. Their models come from packages of the extra ``manipulation``."""

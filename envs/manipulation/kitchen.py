@@ -1,0 +1,113 @@
+"""Define the Franka kitchen: an arm that has to complete four subtasks, in any order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.brax_base import State
+from envs.families import TaskSpec
+from envs.manipulation.kitchen_model import arm_config, stepped_model, whole_model
+from envs.manipulation.kitchen_rig import FRAME_SKIP, START_QPOS, SUBTASKS, KitchenRig
+from envs.physics import MujocoEngine, PipelineState
+from envs.scene import Scene, fixed_view
+from envs.task import SimulatorStates, StateRows, Task, count_rows
+
+_OF_VARIANT = {
+    "mixed": ("microwave", "kettle", "bottom burner", "light switch"),
+    "partial": ("microwave", "kettle", "light switch", "slide cabinet"),
+    "complete": ("microwave", "kettle", "light switch", "slide cabinet"),
+}
+_OBSERVED_QPOS = np.array([*range(9), *range(18, 39)])  # numbers of an observation that are qpos
+_LARGEST_ERROR = 2e-3  # of these; the arm's sensors err by up to 1e-3, and data is float32
+
+
+class Kitchen(Task):
+    """Simulate the kitchen of gymnasium-robotics 1.4.2's ``FrankaKitchen-v1``: qpos 30, qvel 29, action 9.
+
+    The observation is its 59 numbers, errors of the sensors included, which are drawn from the state's key. The
+    discrete state (``extra``, int32[7]) says which of ``kitchen_rig.SUBTASKS`` were completed so far; the task asks for
+    four of them.
+
+    The reward is that number, of the four, minus four, where the reference pays one for each new completion: the count
+    is what SUPE's agents see, and minus four it never speaks against an end by success. As in the reference an episode
+    ends in the very step that completes the last subtask. ``metrics["score"]`` is the share of the four.
+
+    Args:
+        spec: which task.
+        physics: "mujoco".
+    """
+
+    distance_margin = 0.5
+
+    def __init__(self, spec: TaskSpec, physics: str) -> None:
+        model = stepped_model()
+        super().__init__(spec, MujocoEngine(model, KitchenRig(arm_config(model.nv)), FRAME_SKIP))
+        self.subtasks = _OF_VARIANT[spec.variant]
+        self._places = np.array([SUBTASKS.index(name) for name in self.subtasks])
+
+    def reset(self, rng: jax.Array) -> State:
+        """Return the start, which is always the same but for the sensors' errors."""
+        return self.reset_to(jnp.asarray(START_QPOS), jnp.zeros(self.engine.nv), key=rng)
+
+    def reset_to(
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        goal: Any = None,
+        key: jax.Array | None = None,
+        extra: jax.Array | None = None,
+    ) -> State:
+        """Return any simulator state as the first of an episode; the sensors' errors are drawn from ``key``.
+
+        Args and results are those of ``Task.reset_to``.
+        """
+        state = super().reset_to(qpos, qvel, goal, key, extra)
+        return state.replace(metrics=state.metrics | {"score": jnp.zeros(())})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Return the state after one control step under ``action[9]``, over if all four are complete in it."""
+        after = super().step(state, action)
+        score = self.score(after.pipeline_state.extra)
+        success = (score == 1).astype(jnp.float32)
+        return after.replace(
+            done=jnp.maximum(after.done, success),
+            metrics=after.metrics | {"success": success, "score": score},
+            info=after.info | {"truncation": after.info["truncation"] * (1 - success)},
+        )
+
+    def observe(self, pipeline_state: PipelineState) -> jax.Array:
+        """Return float32[59]: qpos and qvel of the arm, of everything else, as the sensors see them."""
+        return pipeline_state.sensed
+
+    def success(self, qpos: Any, goal: Any, extra: Any = None) -> Any:
+        """Return bool[...], whether all four were completed, by ``extra[..., 7]``."""
+        return self.score(extra) == 1
+
+    def score(self, extra: Any) -> Any:
+        """Return float32[...], the share of the four that were completed, by ``extra[..., 7]``; NumPy or jax."""
+        return extra[..., self._places].astype(np.float32).mean(axis=-1)
+
+    def labels(self, states: SimulatorStates, goal: Any = None) -> tuple[Any, Any]:
+        """Return (reward[...], mask[...]): the subtasks completed so far minus four, and 0 where none is left."""
+        score = self.score(states.extra)
+        return 4.0 * (score - 1.0), (score < 1).astype(np.float32)
+
+    def distance_left(self, qpos: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        """Return float64[...], how many of the four are left."""
+        return np.asarray(4.0 * (1.0 - self.score(extra)), np.float64)
+
+    def scene(self) -> Scene:
+        """Return the whole kitchen, from behind the arm or from closer to the things that it moves."""
+        kitchen = fixed_view((-0.2, 0.5, 1.9), azimuth=70.0, elevation=-30.0, distance=2.8)
+        return Scene(whole_model(), {"kitchen": kitchen, "near": fixed_view((-0.2, 0.5, 2.0), 70.0, -35.0, 2.2)})
+
+    def check_steps(self, rows: StateRows) -> list[str]:
+        """Return a line where states and observations disagree by more than the sensors err."""
+        if rows.qpos is None:
+            return []
+        differ = np.abs(rows.observations[:, _OBSERVED_QPOS] - rows.qpos).max(axis=1) > _LARGEST_ERROR
+        return [f"qpos and observations disagree on the state in {count_rows(differ)}"] if differ.any() else []

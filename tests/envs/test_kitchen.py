@@ -1,0 +1,175 @@
+"""The kitchen is gymnasium-robotics' FrankaKitchen-v1, bit for bit, given its sensors' errors."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import envs
+import envs.gym_api
+from envs import render
+from envs.manipulation.kitchen_rig import START_QPOS, SUBTASKS
+from envs.physics.mujoco.engine import _SENSORS
+from tests.envs.kitchen_reference import kitchen, reference, rollout
+
+
+@pytest.fixture(scope="module")
+def env() -> Any:
+    return kitchen("kitchen-mixed")
+
+
+Start = tuple[np.ndarray, np.ndarray] | None  # (qpos, qvel) in float32; None: the task's
+
+
+@pytest.fixture(scope="module")
+def three(env: Any) -> Any:
+    """Three kitchens at once, which start anew by themselves."""
+    auto = envs.AutoReset(env)
+    return SimpleNamespace(reset=jax.jit(jax.vmap(auto.reset)), step=jax.jit(jax.vmap(auto.step)))
+
+
+def played(env: Any, actions: np.ndarray, key: jax.Array, start: Start) -> tuple[Any, Any, np.ndarray]:
+    """The first state, all that follow, and the errors float32[T + 1, 59] that were drawn."""
+
+    def step(state: Any, action: jax.Array) -> tuple[Any, tuple[Any, jax.Array]]:
+        noise = env.engine._draw(state.pipeline_state.carry.key)[0][0]
+        state = env.step(state, action)
+        return state, (state, noise)
+
+    begin = (lambda key: env.reset(key)) if start is None else (lambda key: env.reset_to(*start, key=key))
+    first = jax.jit(begin)(key)
+    _, (states, noise) = jax.jit(lambda state: jax.lax.scan(step, state, actions))(first)
+    first_noise = env.engine._draw(jax.random.fold_in(key, _SENSORS))[0][0]
+    return first, states, np.concatenate([first_noise[None], noise])
+
+
+def assert_the_same(
+    env: Any, actions: np.ndarray, patch: pytest.MonkeyPatch, seed: int = 3, start: Start = None
+) -> dict[str, np.ndarray]:
+    """Compare an episode with the reference's; return the reference's."""
+    first, states, noise = played(env, actions, jax.random.key(seed), start)
+    expected = rollout(reference(patch, env), actions, noise, start)
+    steps = len(expected["reward"])
+    exact = np.concatenate(env.engine.exact_state(states.pipeline_state), axis=-1)
+    np.testing.assert_array_equal(exact[:steps], expected["state"])
+    observations = np.concatenate([first.obs[None], states.obs])[: steps + 1]
+    np.testing.assert_array_equal(observations, expected["observation"].astype(np.float32))
+    completed = np.concatenate([[0], 4 * np.asarray(states.metrics["score"])])[: steps + 1]
+    np.testing.assert_array_equal(completed[1:], expected["completed"])
+    np.testing.assert_array_equal(np.diff(completed), expected["reward"])
+    np.testing.assert_array_equal(states.reward[:steps], completed[:-1] - 4)
+    done, truncated = np.asarray(states.done)[:steps], np.asarray(states.info["truncation"])[:steps]
+    np.testing.assert_array_equal(done, expected["terminated"] | expected["truncated"])
+    np.testing.assert_array_equal(done * (1 - truncated), expected["terminated"])
+    np.testing.assert_array_equal(states.metrics["success"][:steps], expected["terminated"])
+    return expected
+
+
+def random_actions(steps: int, seed: int) -> np.ndarray:
+    """Random actions that last for a while, beyond the range too: both clip."""
+    held = np.random.default_rng(seed).uniform(-1.3, 1.3, (-(-steps // 10), 9))
+    return np.repeat(held, 10, axis=0)[:steps].astype(np.float32)
+
+
+def test_random_steps_equal_the_reference_bit_for_bit(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = assert_the_same(env, random_actions(280, 0), monkeypatch)
+    assert expected["truncated"].tolist() == [False] * 279 + [True]
+
+
+def almost_done() -> tuple[np.ndarray, np.ndarray]:
+    """A start with the microwave's door, the kettle and the burner's knob on their way, and the light on."""
+    qpos, qvel = START_QPOS.astype(np.float32), np.zeros(29, np.float32)
+    qpos[[17, 18]] = -0.69, -0.05
+    qpos[[11, 12]], qvel[11] = (-0.5785, -0.01), -6.0
+    qpos[22], qvel[22] = -0.42, -4.0
+    qpos[23:30], qvel[24] = (-0.23, 0.3, 1.62, 0.99, 0, 0, -0.06), 2.0
+    return qpos, qvel
+
+
+def test_subtasks_count_once_and_the_last_one_ends_the_episode_as_in_the_reference(
+    env: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = assert_the_same(env, 0.3 * random_actions(10, 1), monkeypatch, start=almost_done())
+    steps = len(expected["reward"])
+    assert 2 <= steps < 10 and expected["reward"].tolist() == [3, *[0] * (steps - 2), 1]
+    assert expected["terminated"].tolist() == [False] * (steps - 1) + [True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kitchen-mixed", "kitchen-partial"])
+def test_two_thousand_random_steps_equal_the_reference(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = kitchen(name)
+    for seed in range(8):
+        assert_the_same(env, random_actions(280, 100 + seed), monkeypatch, seed)
+
+
+def test_a_batch_equals_single_steps_and_a_state_goes_on_where_it_was(env: Any, three: Any) -> None:
+    actions = random_actions(6, 2)
+    batch = np.repeat(actions[:, None], 3, axis=1)
+    keys = jax.random.split(jax.random.key(5), 3)
+    states = [three.reset(keys)]
+    for action in (*batch, *batch[3:]):
+        states.append(three.step(states[3] if len(states) == 7 else states[-1], action))
+    np.testing.assert_array_equal(states[6].obs, states[9].obs)
+    assert len(np.unique(states[6].obs[:, 0])) == 3  # the sensors err differently
+    _, singles, _ = played(env, actions, keys[1], None)
+    np.testing.assert_array_equal(states[6].obs[1], singles.obs[-1])
+
+
+def test_completed_subtasks_are_state_that_can_be_given_and_decide_reward_and_success(env: Any) -> None:
+    assert env.subtasks == ("microwave", "kettle", "bottom burner", "light switch")
+    extra = np.zeros((3, 7), np.int32)
+    extra[1, [SUBTASKS.index("microwave"), SUBTASKS.index("top burner")]] = 1  # of which mixed asks for the first
+    extra[2] = 1
+    state = jax.jit(jax.vmap(lambda extra: env.reset_to(START_QPOS, np.zeros(29), extra=extra)))(extra)
+    after = jax.jit(jax.vmap(env.step))(state, np.zeros((3, 9)))
+    np.testing.assert_array_equal(after.pipeline_state.extra, extra)
+    np.testing.assert_array_equal(after.reward, [-4, -3, 0])
+    np.testing.assert_array_equal(after.metrics["score"], [0, 0.25, 1])
+    np.testing.assert_array_equal(after.done, [0, 0, 1])
+    assert env.distance_left(np.zeros((3, 30)), extra).tolist() == [4, 3, 0]
+    rows: Any = SimpleNamespace(qpos=None, extra=extra)
+    for labelled in (env.labels(rows), env.labels(SimpleNamespace(qpos=None, extra=jnp.asarray(extra)))):
+        np.testing.assert_array_equal(labelled, [[-4, -3, 0], [1, 1, 0]])
+    assert kitchen("kitchen-partial").score(extra).tolist() == [0, 0.25, 1]
+
+
+def test_a_broken_state_is_reset_alone(three: Any) -> None:
+    states = three.reset(jax.random.split(jax.random.key(0), 3))
+    broken = states.pipeline_state.replace(qpos=states.pipeline_state.qpos.at[1, 0].set(jnp.nan))
+    after = three.step(states.replace(pipeline_state=broken), np.ones((3, 9), np.float32))
+    np.testing.assert_array_equal(after.metrics["nan"], [0, 1, 0])
+    assert bool(jnp.isfinite(after.obs).all()) and after.pipeline_state.steps.tolist() == [1, 0, 1]
+
+
+def test_gymnasium_makes_one_and_a_batch() -> None:
+    single = gymnasium.make("qdos/kitchen-mixed-v0", disable_env_checker=True)
+    check_env(single.unwrapped, skip_render_check=True)
+    batch = gymnasium.make_vec("qdos/kitchen-mixed-v0", num_envs=3)
+    assert batch.reset(seed=0)[0].shape == (3, 59)
+    _, rewards, terminated, truncated, _ = batch.step(np.zeros((3, 9), np.float32))
+    assert rewards.tolist() == [-4] * 3 and not (terminated | truncated).any()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_picture_shows_the_arm_and_what_it_moves(env: Any) -> None:
+    opened = START_QPOS.copy()
+    opened[22] = -1.0
+    with render.Renderer(env, 96) as renderer:
+        shut, moved = renderer.frame(START_QPOS, ()), renderer.frame(opened, ())
+    assert shut.shape == (96, 128, 3) and shut.std() > 20 and (shut != moved).any()
+
+
+def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(
+        ValueError, match=r"gymnasium-robotics, which is not installed; run: pip install .*manipulation"
+    ):
+        envs.make("kitchen", physics="mujoco")
