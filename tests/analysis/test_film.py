@@ -17,6 +17,7 @@ from qdos_brax.analysis import film, strip
 from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.commands import main as commands
 from qdos_brax.errors import UserError
+from qdos_brax.report import picture
 from qdos_brax.report.video import mp4
 from tests.report.folders import write_run
 
@@ -145,6 +146,22 @@ def test_picture_of_a_run(finished: Path, tmp_path: Path, monkeypatch: pytest.Mo
         assert main(f"picture {finished} --out {tmp_path}/run.png") == 0
         widths.append(matplotlib.image.imread(tmp_path / "run.png").shape[1])
     assert widths[1] == widths[0] * 5 // 4  # four frames, and the map of latents beside them
+
+
+def test_a_folder_called_like_a_task_is_drawn_by_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn: list[tuple[str, str]] = []
+    monkeypatch.setattr(strip, "draw_run", lambda run, out: drawn.append(("run", str(run))))
+    monkeypatch.setattr(picture, "draw_task", lambda name, out: drawn.append(("task", name)))
+    (tmp_path / "antsoccer").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main("picture antsoccer --out a.png") == 0
+    out, err = capsys.readouterr()
+    assert out == "a.png\n" and err == "note: drew the task; for the folder of that name write ./antsoccer\n"
+    assert main("picture ./antsoccer --out a.png") == 0 and main("picture antmaze --out a.png") == 0
+    assert drawn == [("task", "antsoccer"), ("run", "antsoccer"), ("task", "antmaze")]
+    assert capsys.readouterr().err == ""
 
 
 def test_latents_of_a_run_are_those_of_its_analysis(tmp_path: Path) -> None:
