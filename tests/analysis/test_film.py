@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shlex
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import imageio_ffmpeg
 import jax
 import matplotlib.image
 import numpy as np
+import PIL.Image
 import pytest
 
 from envs import render
@@ -18,7 +20,7 @@ from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.commands import main as commands
 from qdos_brax.errors import UserError
 from qdos_brax.report import picture
-from qdos_brax.report.video import mp4
+from qdos_brax.report.video import mp4, webp
 from tests.report.folders import write_run
 
 CAP = 25
@@ -88,6 +90,18 @@ def test_frames_are_what_was_written(tmp_path: Path, height: int, monkeypatch: p
     assert about["fps"] == 25 and len(frames) == 3
     assert frames.shape[1:] == (height - height % 2, 64, 3)
     np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)), [0, 120, 250], atol=4)
+
+
+def test_a_small_film_is_what_was_drawn() -> None:
+    """Frames of one colour each, at ten per second; they play again and again."""
+    levels = (0, 120, 250)
+    content = webp(np.stack([np.full((24, 32, 3), level, np.uint8) for level in levels]), fps=10)
+    with PIL.Image.open(io.BytesIO(content)) as image:
+        assert image.n_frames == 3 and image.size == (32, 24) and image.info["loop"] == 0
+        for i, level in enumerate(levels):
+            image.seek(i)
+            np.testing.assert_allclose(np.asarray(image.convert("RGB")), level, atol=4)
+            assert image.info["duration"] == 100
 
 
 def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
