@@ -64,7 +64,11 @@ def main_parser(argv: Sequence[str]) -> Parser:
     report.set_defaults(run=_report)
 
     picture = commands.add_parser("picture", help="draw a task at its start, or an episode and the latents of a run")
-    picture.add_argument("subject", metavar="TASK|RUN", help="a task (python -m qdos_brax tasks), or a finished run")
+    picture.add_argument(
+        "subject",
+        metavar="TASK|RUN",
+        help="a task (python -m qdos_brax tasks), or the folder of a finished run; ./NAME if it is called like a task",
+    )
     picture.add_argument("--out", metavar="FILE", required=True, help="the picture to write, as .png")
     picture.set_defaults(run=_picture)
 
@@ -110,7 +114,8 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _picture(args: argparse.Namespace) -> int:
-    if Path(args.subject).is_dir():
+    folder, task = Path(args.subject).is_dir(), _is_task(args.subject)
+    if folder and not task:
         from qdos_brax.analysis.strip import draw_run
 
         draw_run(Path(args.subject), Path(args.out))
@@ -119,7 +124,19 @@ def _picture(args: argparse.Namespace) -> int:
 
         draw_task(args.subject, Path(args.out))
     print(args.out)
+    if folder and task:
+        print(f"note: drew the task; for the folder of that name write ./{args.subject}", file=sys.stderr)
     return 0
+
+
+def _is_task(name: str) -> bool:
+    import envs
+
+    try:
+        envs.get_spec(name)
+    except ValueError:
+        return False
+    return True
 
 
 def _tasks(args: argparse.Namespace) -> int:
