@@ -10,8 +10,8 @@ from qdos_brax.report.video import webp
 
 _FRAMES = 6
 _HEIGHT, _WIDTH = 240, 320
-_FILM_FRAMES = 80  # at most: some 170 kB, of which a page of nine members holds nine
-_FILM_RATE = 10.0  # frames per second
+_FILM_FRAMES = 48  # at most: drawing them is a part of every run's end
+_FILM_RATE = 8.0  # frames per second
 _NEAR = "follow"
 
 
