@@ -1,4 +1,4 @@
-"""Scripted demonstrators, by the family of tasks that they play; imported on first use, since they need packages."""
+"""Scripted demonstrators, by the family of tasks that they play."""
 
 from __future__ import annotations
 
@@ -7,40 +7,29 @@ import importlib
 from envs.families import TaskSpec
 from envs.task import Task
 from qdos_brax.collection.scripted.demonstrator import Demonstrator
-from qdos_brax.errors import UserError
 
-_DEMONSTRATORS: dict[str, str | type[Demonstrator]] = {
+DEMONSTRATORS: dict[str, str | type[Demonstrator]] = {
     "kitchen": "qdos_brax.collection.scripted.kitchen:KitchenDemonstrator",
     "cube": "qdos_brax.collection.scripted.manipspace:CubeDemonstrator",
     "scene": "qdos_brax.collection.scripted.manipspace:SceneDemonstrator",
 }
+"""The class that plays a family; as "module:class" it is imported on first use, since some need packages."""
 
 
 def register_demonstrator(family: str, demonstrator: str | type[Demonstrator]) -> None:
-    """Have the tasks of ``family`` played by a class, or by "module:class", which is imported on first use.
+    """Register the class, or "module:class", that plays the tasks of ``family``.
 
     Raises:
         ValueError: the family already has one.
     """
-    if family in _DEMONSTRATORS:
-        raise ValueError(f"{family} already has a demonstrator")
-    _DEMONSTRATORS[family] = demonstrator
-
-
-def is_scripted(spec: TaskSpec) -> bool:
-    """Return whether a demonstrator plays the task."""
-    return spec.family in _DEMONSTRATORS
+    if family in DEMONSTRATORS:
+        raise ValueError(f"there is already a demonstrator of {family!r}")
+    DEMONSTRATORS[family] = demonstrator
 
 
 def demonstrator_class(spec: TaskSpec) -> type[Demonstrator]:
-    """Return the class that plays the task.
-
-    Raises:
-        UserError: no demonstrator plays it.
-    """
-    if spec.family not in _DEMONSTRATORS:
-        raise UserError(f"no demonstrator plays {spec.family}, so no data can be collected; train with --dataset FILE")
-    found = _DEMONSTRATORS[spec.family]
+    """Return the class that plays a task whose family is among ``DEMONSTRATORS``."""
+    found = DEMONSTRATORS[spec.family]
     if not isinstance(found, str):
         return found
     module, _, name = found.partition(":")
@@ -49,14 +38,11 @@ def demonstrator_class(spec: TaskSpec) -> type[Demonstrator]:
 
 
 def make(env: Task, n: int, noise: float) -> Demonstrator:
-    """Return the demonstrator that plays n simulations of a task at once.
+    """Return a demonstrator that plays n simulations of a task at once.
 
     Args:
-        env: the task.
+        env: the task, of a family among ``DEMONSTRATORS``.
         n: simulations.
         noise: standard deviation of the action noise, but for noisy episodes.
-
-    Raises:
-        UserError: no demonstrator plays the task.
     """
     return demonstrator_class(env.spec)(env, n, noise)

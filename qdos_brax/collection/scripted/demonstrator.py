@@ -13,8 +13,8 @@ class SimStates(NamedTuple):
     """Hold n simulations before a control step, in NumPy; a demonstrator reads these arrays and changes none.
 
     Attributes:
-        qpos: float64[n, nq], exact.
-        qvel: float64[n, nv], exact.
+        qpos: float64[n, nq], exact; at the start of an episode what ``begin`` returned, rounded to float32.
+        qvel: float64[n, nv], likewise.
         extra: int32[n, e], the discrete state; e may be 0.
         sensed: float32[n, k], what the task's rig senses, errors included; k may be 0.
     """
@@ -29,8 +29,8 @@ class Demonstrator(Protocol):
     """Play episodes in n simulations at once, in NumPy.
 
     A class is registered by the name of its family of tasks (``qdos_brax.collection.scripted``). What it remembers
-    between two steps (a plan, a goal, a counter) it keeps itself; ``begin`` forgets all of it. All its random numbers
-    come from the generators it is given.
+    between two steps (a plan, a goal, a counter) it keeps itself; ``begin`` forgets all of it, since one demonstrator
+    plays many episodes, one after another. All its random numbers come from the generators it is given.
 
     Args:
         env: the task; the set serves all tasks of its variant, so that goals are the demonstrator's own choice.
