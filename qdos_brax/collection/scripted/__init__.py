@@ -1,0 +1,1 @@
+"""Demonstrations by script, for tasks that no trained expert is shipped for."""
