@@ -1,0 +1,1 @@
+"""Collecting data of manipulation tasks: scripted demonstrators that play in many simulations at once."""
