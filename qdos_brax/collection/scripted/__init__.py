@@ -1,1 +1,1 @@
-"""Demonstrations by script, for tasks that no trained expert is shipped for."""
+"""Collecting data of manipulation tasks: scripted demonstrators that play in many simulations at once."""
