@@ -109,7 +109,8 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
         episodes: episodes per member.
 
     Returns:
-        One dict per member: seed, alpha, and whatever else varies, success (0..1), return, length, episodes.
+        One dict per member: seed, alpha, and whatever else varies, success (0..1), return, length, episodes; the
+        score (0..1) of a task with parts.
 
     Raises:
         UserError: it is no run folder, or the run has not finished.
@@ -128,6 +129,8 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
         "return": np.asarray(result.episode_return).mean(axis=-1),
         "length": np.asarray(result.length).mean(axis=-1),
     }
+    if result.score is not None:
+        means["score"] = np.asarray(result.score).mean(axis=-1)
     return [
         {**member, **{name: float(value[index]) for name, value in means.items()}, "episodes": episodes}
         for index, member in enumerate(members)

@@ -14,13 +14,19 @@ from qdos_brax.high_level.macro_step import macro_step
 
 
 class Episodes(NamedTuple):
-    """Hold one entry per episode: success[N] (0 or 1), undiscounted episode_return[N], length[N] in environment
-    steps.
+    """Hold one entry per episode.
+
+    Attributes:
+        success: [N], 0 or 1.
+        episode_return: [N], undiscounted.
+        length: [N], in environment steps.
+        score: [N], the largest share of the task that was done; None for tasks that have no parts.
     """
 
     success: jax.Array
     episode_return: jax.Array
     length: jax.Array
+    score: jax.Array | None = None
 
 
 def evaluate(
@@ -42,31 +48,36 @@ def evaluate(
         horizon: environment steps per decision.
     """
 
-    def one(state: State) -> tuple[State, jax.Array, jax.Array, jax.Array]:
+    def one(state: State) -> tuple[State, Episodes]:
         latent = choose(state.obs)
         state, result = macro_step(env, lambda observation: play(observation, latent), state, horizon, 1.0)
-        return state, result.success, result.episode_return, result.steps
+        return state, Episodes(result.success, result.episode_return, result.steps, result.score)
 
     def going(carry: tuple[State, Episodes]) -> jax.Array:
         return jnp.any(carry[0].done < 0.5)
 
     def body(carry: tuple[State, Episodes]) -> tuple[State, Episodes]:
         state, totals = carry
-        state, success, episode_return, steps = jax.vmap(one)(state)
+        state, found = jax.vmap(one)(state)
         totals = Episodes(
-            jnp.maximum(totals.success, success), totals.episode_return + episode_return, totals.length + steps
+            jnp.maximum(totals.success, found.success),
+            totals.episode_return + found.episode_return,
+            totals.length + found.length,
+            None if totals.score is None or found.score is None else jnp.maximum(totals.score, found.score),
         )
         return state, totals
 
     start = jax.vmap(env.reset)(jax.random.split(key, episodes))
-    zeros = jnp.zeros(episodes)
-    return jax.lax.while_loop(going, body, (start, Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32))))[1]
+    zeros, score = jnp.zeros(episodes), jnp.zeros(episodes) if "score" in start.metrics else None
+    nothing = Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32), score)
+    return jax.lax.while_loop(going, body, (start, nothing))[1]
 
 
 def summary(episodes: Episodes) -> dict[str, np.ndarray]:
-    """Return columns of metrics.csv, [members] each, of episodes[members, N]."""
+    """Return columns of metrics.csv, [members] each, of episodes[members, N]; "eval/score" for tasks with parts."""
     success = np.asarray(episodes.success)
-    return {
+    score = {} if episodes.score is None else {"eval/score": np.asarray(episodes.score).mean(axis=-1)}
+    return score | {
         "eval/success": success.mean(axis=-1),
         "eval/return": np.asarray(episodes.episode_return).mean(axis=-1),
         "eval/length": np.asarray(episodes.length).mean(axis=-1),
