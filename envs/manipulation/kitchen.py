@@ -39,13 +39,18 @@ class Kitchen(Task):
     Args:
         spec: which task.
         physics: "mujoco".
+
+    Attributes:
+        subtasks: the four, by name.
+        arm: the arm's limits and its sensors' errors.
     """
 
     distance_margin = 0.5
 
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         model = stepped_model()
-        super().__init__(spec, MujocoEngine(model, KitchenRig(arm_config(model.nv)), FRAME_SKIP))
+        self.arm = arm_config(model.nv)
+        super().__init__(spec, MujocoEngine(model, KitchenRig(self.arm), FRAME_SKIP))
         self.subtasks = _OF_VARIANT[spec.variant]
         self._places = np.array([SUBTASKS.index(name) for name in self.subtasks])
 

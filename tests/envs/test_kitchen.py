@@ -17,6 +17,7 @@ import envs.gym_api
 from envs import render
 from envs.manipulation.kitchen_rig import START_QPOS, SUBTASKS
 from envs.physics.mujoco.engine import _SENSORS
+from qdos_brax.high_level.evaluation import evaluate, summary
 from tests.envs.kitchen_reference import kitchen, reference, rollout
 
 
@@ -139,6 +140,18 @@ def test_completed_subtasks_are_state_that_can_be_given_and_decide_reward_and_su
     for labelled in (env.labels(rows), env.labels(SimpleNamespace(qpos=None, extra=jnp.asarray(extra)))):
         np.testing.assert_array_equal(labelled, [[-4, -3, 0], [1, 1, 0]])
     assert kitchen("kitchen-partial").score(extra).tolist() == [0, 0.25, 1]
+
+
+def test_an_evaluation_tells_the_share_of_the_four(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(envs.Task, "episode_length", 4)  # three are completed in the first step, the kettle never
+    qpos, qvel = almost_done()
+    qvel[24] = 0
+    monkeypatch.setattr(env, "reset", lambda key: env.reset_to(qpos, qvel, key=key))
+    found = evaluate(env, lambda obs: obs[:1], lambda obs, latent: jnp.zeros(9), jax.random.key(0), 2, 2)
+    assert found.score is not None and found.score.tolist() == [0.75, 0.75]
+    members = type(found)(*(part[None] for part in found))
+    assert summary(members)["eval/score"].tolist() == [0.75] and summary(members)["eval/success"].tolist() == [0]
+    assert "eval/score" not in summary(members._replace(score=None))
 
 
 def test_a_broken_state_is_reset_alone(three: Any) -> None:
