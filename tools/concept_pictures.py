@@ -50,47 +50,46 @@ def picture(width: int, height: int, title: str, parts: Sequence[str]) -> str:
 
 
 def method() -> str:
-    """Return the picture of a run: what is learned from the data, and what online."""
+    """Return the picture of a run: what is learned from the data, and what online; narrow, for a phone."""
     title = "Values weigh segments, skills are learned from them, SAC learns online which skill to play"
-    return picture(900, 390, title, [
-        box(20, 40, 200, 84, ["mixed data", "good moves, failures,", "noise"], DATA),
-        box(260, 40, 180, 84, ["1 values", "how far is each state", "from success?"], OFFLINE),
-        box(470, 40, 200, 84, ["weights", "exp(advantage / lambda)", "of each segment"], OFFLINE),
-        box(700, 40, 180, 84, ["2 skills", "trajectory VAE:", "a latent z for H steps"], OFFLINE),
-        box(480, 190, 180, 64, ["information term", "alpha keeps skills apart"], OFFLINE),
-        box(20, 190, 420, 64, ["3 labels", "skill, reward and novelty of each logged segment"], OFFLINE),
-        box(20, 300, 420, 70, ["4 online: SAC over skills", "batches: half labels, half replay"], ONLINE),
-        box(700, 300, 180, 70, ["environment", "H steps per decision"], DATA),
-        arrow((220, 82), (258, 82)),
-        arrow((440, 82), (468, 82)),
-        arrow((670, 82), (698, 82)),
-        arrow((660, 222), (790, 222), (790, 127)),
-        arrow((120, 124), (120, 188)),
-        arrow((820, 124), (820, 298), label="the decoder acts", at=(740, 285)),
-        arrow((230, 254), (230, 298)),
-        arrow((440, 335), (698, 335), label="z", at=(570, 330)),
-        arrow((700, 355), (443, 355), label="reward, next state", at=(570, 372)),
+    return picture(500, 512, title, [
+        box(20, 20, 460, 50, ["mixed data", "good moves, failures, noise"], DATA),
+        box(20, 110, 220, 64, ["1 values", "how far from success?"], OFFLINE),
+        box(260, 110, 220, 64, ["weights of segments", "exp(advantage / lambda)"], OFFLINE),
+        box(20, 214, 220, 64, ["information term", "alpha keeps skills apart"], OFFLINE),
+        box(260, 214, 220, 64, ["2 skills", "trajectory VAE: latents z"], OFFLINE),
+        box(20, 318, 460, 50, ["3 labels", "skill, reward and novelty of each logged segment"], OFFLINE),
+        box(20, 408, 220, 84, ["4 online: SAC", "batches: half labels,", "half replay"], ONLINE),
+        box(320, 408, 160, 84, ["environment", "the decoder acts", "for H steps"], DATA),
+        arrow((130, 70), (130, 108)),
+        arrow((240, 142), (258, 142)),
+        arrow((370, 174), (370, 212)),
+        arrow((240, 246), (258, 246)),
+        arrow((370, 278), (370, 316)),
+        arrow((130, 368), (130, 406)),
+        arrow((240, 435), (318, 435), label="z", at=(280, 428)),
+        arrow((320, 465), (243, 465), label="reward", at=(282, 484)),
     ])  # fmt: skip
 
 
 def macro_step() -> str:
     """Return the picture of an episode: a decision every H steps, each one transition of the high level."""
     parts = []
-    for i in range(3):
-        x = 110 + 250 * i
-        parts.append(box(x, 20, 240, 34, [f"decision {i + 1}: latent z{'₁₂₃'[i]}"], ONLINE))
+    for i in range(2):
+        x = 104 + 196 * i
+        parts.append(box(x, 16, 186, 34, [f"decision {i + 1}: latent z{'₁₂'[i]}"], ONLINE))
         parts += [
-            f'<rect x="{x + 24 * k}" y="78" width="22" height="30" rx="3" fill="{OFFLINE}" stroke="{SOFT}"/>'
-            for k in range(10)
+            f'<rect x="{x + 21 * k}" y="76" width="18" height="30" rx="3" fill="{OFFLINE}" stroke="{SOFT}"/>'
+            for k in range(9)
         ]
-        parts.append(arrow((x + 120, 54), (x + 120, 76)))
-        told = "one transition: s, z, r, next s"
-        parts.append(f'<text x="{x + 120}" y="134" text-anchor="middle" fill="{SOFT}">{told}</text>')
+        parts.append(arrow((x + 93, 50), (x + 93, 74)))
+        told = escape("one transition: s, z, r, s'")
+        parts.append(f'<text x="{x + 93}" y="130" text-anchor="middle" fill="{SOFT}">{told}</text>')
     parts += [
-        f'<text x="14" y="42" fill="{SOFT}">high level</text>',
-        f'<text x="14" y="98" fill="{SOFT}">environment</text>',
+        f'<text x="10" y="38" fill="{SOFT}">high level</text>',
+        f'<text x="10" y="96" fill="{SOFT}">environment</text>',
     ]
-    return picture(900, 150, "Every H environment steps the high level chooses a skill", parts)
+    return picture(500, 146, "Every H environment steps the high level chooses a skill", parts)
 
 
 PICTURES = {"method.svg": method, "macro-step.svg": macro_step}
