@@ -18,10 +18,10 @@ from qdos_brax.analysis.finished import TrainedRun, evaluation_key
 from qdos_brax.analysis.pictures import draw_episode
 from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.data.device import DeviceData, to_device
+from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.data.segments import window
 from qdos_brax.files import write_arrays
-from qdos_brax.methods.build import make_low_level
+from qdos_brax.methods.low_level_kinds import make_low_level
 from qdos_brax.skills.vae import Segments
 from qdos_brax.skills.weights import advantage_weights
 
@@ -98,7 +98,8 @@ class _Sample(NamedTuple):
 
 def _sample(trained: TrainedRun, dataset: Dataset) -> _Sample:
     """Draw random segments, the same ones for every method on the same data."""
-    data, _ = to_device(dataset, trained.config.skills.horizon)
+    normaliser = Normaliser(**jax.tree.map(lambda leaf: leaf[0], trained.artifacts["normaliser"]))  # all have the same
+    data, _ = to_device(dataset, trained.config.skills.horizon, normaliser)
     total = data.starts.shape[0]
     chosen = np.sort(np.random.default_rng(_SEED).choice(total, min(_SEGMENTS, total), replace=False))
     return _Sample(dataset, data, chosen, np.asarray(data.starts)[chosen])

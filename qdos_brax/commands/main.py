@@ -1,4 +1,4 @@
-"""The commands of ``python -m qdos_brax``: train, data, evaluate, report, picture, tasks, doctor."""
+"""The commands of ``python -m qdos_brax``: train, data, evaluate, export, report, picture, tasks, doctor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qdos_brax import __version__
-from qdos_brax.commands.arguments import Parser, guarded, parse, positive
+from qdos_brax.commands.arguments import Parser, guarded, natural, parse, positive
 from qdos_brax.commands.config import add_parser as add_config
 from qdos_brax.commands.streams import lasting_streams
 from qdos_brax.commands.train import train_main
@@ -41,15 +41,21 @@ def main_parser(argv: Sequence[str]) -> Parser:
 
         add_parser(commands)
     else:
-        commands.add_parser("data", help="make, fetch, describe and check data files")
+        commands.add_parser("data", help="make, fetch, describe, check and export data files")
 
     evaluate = commands.add_parser("evaluate", help="evaluate the policy of a run")
-    evaluate.add_argument("runs", metavar="RUN", nargs="+", help="a run folder")
+    evaluate.add_argument("runs", metavar="RUN", nargs="+", help="a run folder, or a file that `export` wrote")
     evaluate.add_argument("--episodes", metavar="N", type=positive, default=20, help="episodes per member (default 20)")
     evaluate.add_argument(
         "--video", metavar="FILE", help="also film the first member's first episode, as .mp4; takes one RUN"
     )
     evaluate.set_defaults(run=_evaluate)
+
+    export = commands.add_parser("export", help="write skills and policy of a run to one file, to hand on")
+    export.add_argument("run_folder", metavar="RUN", help="the folder of a finished run")
+    export.add_argument("--out", metavar="FILE", required=True, help="the file to write, as .safetensors")
+    export.add_argument("--member", metavar="N", type=natural, help="one member, from 0 (default: all)")
+    export.set_defaults(run=_export)
 
     report = commands.add_parser("report", help="tables, learning curves and a page of runs")
     report.add_argument("runs", metavar="RUN", nargs="+", help="the folder of a finished run or comparison")
@@ -98,6 +104,15 @@ def _evaluate(args: argparse.Namespace) -> int:
     for run in args.runs:
         for member in evaluate_run(Path(run), args.episodes):
             print(f"{run}: " + ", ".join(f"{name} {value:g}" for name, value in member.items()))
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    from qdos_brax.runs.export import export_run
+
+    for member in export_run(Path(args.run_folder), Path(args.out), args.member):
+        print(", ".join(f"{name} {value}" for name, value in member.items()))
+    print(args.out)
     return 0
 
 
