@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -104,11 +106,13 @@ class Task(Env, ABC):
         jump: distance that the first two numbers of an observation, a position then, never move in one control step;
             None where they are no position. Readers of data files find unmarked ends of episodes by it.
         body_frame: which numbers of an observation move and turn with the body.
+        unfit: why known files of the same scene cannot be used, by their numbers per observation.
     """
 
     distance_margin = 0.0
     jump: float | None = None
     body_frame: BodyFrame | None = None
+    unfit: Mapping[int, str] = MappingProxyType({})
 
     def __init__(self, spec: TaskSpec, engine: Engine, goal: Any = ()) -> None:
         self.spec = spec

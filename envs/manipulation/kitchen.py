@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -46,6 +47,9 @@ class Kitchen(Task):
     """
 
     distance_margin = 0.5
+    unfit = MappingProxyType(
+        {60: "D4RL's kitchen: 30 positions and the goal, neither velocities nor simulator states; use data make"}
+    )
 
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         model = stepped_model()

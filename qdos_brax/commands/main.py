@@ -170,7 +170,8 @@ def _tasks(args: argparse.Namespace) -> int:
             for (full, task), short in aliases.items()
             if full == name
         ]
-        variants = [f"task1 to task{count}", f"task{default.task_id}", *(alias or [""])]
+        numbers = "task1" if count == 1 else f"task1 to task{count}"
+        variants = [numbers, f"task{default.task_id}", *(alias or [""])]
         rows.append([name, *sizes, ", ".join(family.engines), *variants])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:

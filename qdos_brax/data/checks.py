@@ -134,6 +134,9 @@ def _sizes(rows: Rows, env: Task) -> list[str]:
     obs, act = env.observation_size, env.action_size
     widths = {"observations": obs, "next_observations": obs, "actions": act}
     widths |= {"qpos": env.engine.nq, "qvel": env.engine.nv, "extra": env.extra_size}
+    numbers = rows.observations.shape[-1]
+    if numbers in env.unfit:
+        return [f"observations have {numbers} numbers, {env.spec.name} has {obs}: {env.unfit[numbers]}"]
     lines = []
     for key, width in widths.items():
         array = getattr(rows, key)
