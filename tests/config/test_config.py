@@ -147,7 +147,7 @@ def test_wrong_settings_are_one_line(text: str, message: str) -> None:
 def test_unknown_names_propose_the_nearest() -> None:
     with pytest.raises(UserError, match="did you mean 'antmaze-large'"):
         load_config("antmase-large", "cpu")
-    for name in ("cube-single", "kitchen-huge", "antmaze-huge", "antmaze-medium-task9"):  # a YAML alone makes no task
+    for name in ("cube-tripple", "kitchen-huge", "antmaze-huge", "antmaze-medium-task9"):  # a YAML alone makes no task
         with pytest.raises(UserError, match=f"there is no task '{name}'") as caught:
             configs.load_programs(name, "cpu")
         assert "\n" not in str(caught.value)
