@@ -1,4 +1,4 @@
-"""``python -m qdos_brax data``: make, fetch, describe and check data files."""
+"""``python -m qdos_brax data``: make, fetch, describe, check and export data files."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 
 import envs
 from qdos_brax.collection import recipes
-from qdos_brax.collection.collector import Collector
 from qdos_brax.collection.default_set import make_file
-from qdos_brax.collection.profiles import profile_of
+from qdos_brax.collection.makers import CollectorMaker, maker_of
 from qdos_brax.config import Config, check_method, load_config
 from qdos_brax.data import checks, download, formats, sources
 from qdos_brax.data.dataset import episode_bounds
@@ -24,8 +23,8 @@ _UNUSABLE = 2  # exit code, as for every error that the user can fix
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``data make | fetch | info | check`` to the subparsers ``commands``; set the handlers as ``run``."""
-    data = commands.add_parser("data", help="make, fetch, describe and check data files")
+    """Add ``data make | fetch | info | check | export`` to the subparsers ``commands``; set the handlers as ``run``."""
+    data = commands.add_parser("data", help="make, fetch, describe, check and export data files")
     actions = data.add_subparsers(metavar="ACTION", required=True)
 
     make = actions.add_parser("make", help="collect a set, by OGBench's recipes or a mixture of good and bad behaviour")
@@ -36,7 +35,7 @@ def add_parser(commands: Any) -> None:
         "--recipe",
         choices=recipes.NAMES,
         default="mixed",
-        help="OGBench's navigate, stitch or explore, or a mixture of good and bad behaviour (default mixed)",
+        help="in mazes OGBench's navigate, stitch or explore; or a mixture of good and bad behaviour (default mixed)",
     )
     make.add_argument(
         "--mix", metavar="M", help="mixed: share of each behaviour, such as expert=0.3,noisy=0.3,wander=0.2,fail=0.2"
@@ -84,6 +83,12 @@ def add_parser(commands: Any) -> None:
     check.add_argument("--map", metavar="FILE", help="also draw the positions in the data, as .png")
     check.set_defaults(run=_check)
 
+    export = actions.add_parser("export", help="write a data file as a Minari set, labelled for a task (extra: minari)")
+    export.add_argument("file", metavar="FILE", help=what)
+    export.add_argument("--env", metavar="TASK", required=True, help="the task, whose rewards it gets")
+    export.add_argument("--out", metavar="DIR", required=True, help="the set's folder, named such as antmaze-medium-v0")
+    export.set_defaults(run=_export)
+
 
 def _make(args: argparse.Namespace) -> int:
     from qdos_brax.runs.jax_setup import prepare_jax  # here, since info and check need no learner
@@ -92,26 +97,25 @@ def _make(args: argparse.Namespace) -> int:
     path = Path(args.out).expanduser()
     if path.suffix not in (".hdf5", ".h5"):
         raise UserError(f"--out {args.out}: data is written as .hdf5; give the file that ending")
-    env = _env(args.task, args.physics)
-    make_file(path, Collector(env, _recipe(args, env)), args.transitions, args.seed, args.num_envs)
+    maker = maker_of(_env(args.task, args.physics))
+    make_file(path, maker.collector(_recipe(args, maker)), args.transitions, args.seed, args.num_envs)
     print(path)
     return 0
 
 
-def _recipe(args: argparse.Namespace, env: envs.Task) -> recipes.CollectionRecipe:
-    body = profile_of(env)
+def _recipe(args: argparse.Namespace, maker: CollectorMaker) -> recipes.CollectionRecipe:
     if args.recipe != "mixed":
         if args.mix is not None or args.degraded_share is not None:
             raise UserError(
                 f"--recipe {args.recipe} takes neither --mix nor --degraded-share; use them with --recipe mixed"
             )
-        return recipes.named(args.recipe, body, args.noise)
+        return maker.named(args.recipe, args.noise)
     noise = recipes.NOISE if args.noise is None else args.noise
     if args.mix is None:
-        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, body, noise)
+        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, maker, noise)
     if args.degraded_share is not None:
         raise UserError("--mix and --degraded-share both set the mixture; give one of them")
-    return recipes.mixed(recipes.parse_mix(args.mix), body, noise)
+    return recipes.mixed(recipes.parse_mix(args.mix), maker, noise)
 
 
 def _fetch(args: argparse.Namespace) -> int:
@@ -186,6 +190,16 @@ def _check(args: argparse.Namespace) -> int:
     reached = sum(1 for first, stop in episodes if (dataset.masks[first:stop] == 0).any())
     print(f"{args.file} fits {env.spec.full_name}: {dataset.size:,} transitions, {len(episodes):,} episodes")
     print(f"{reached:,} episodes reach the goal; {np.mean(dataset.masks == 0):.2%} of the rows are at it")
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    from qdos_brax.data.minari_export import export_minari  # here, since importing gymnasium takes a while
+
+    env = _env(args.env, "mujoco")
+    dataset = formats.read(download.resolve(args.file).path, env)
+    export_minari(dataset, Path(args.out).expanduser(), env.spec.full_name)
+    print(args.out)
     return 0
 
 

@@ -17,10 +17,10 @@ class Episodes(NamedTuple):
     """Hold one entry per episode.
 
     Attributes:
-        success: [N], 0 or 1.
-        episode_return: [N], undiscounted.
-        length: [N], in environment steps.
-        score: [N], the largest share of the task that was done; None for tasks that have no parts.
+        success: float[N], 0 or 1.
+        episode_return: float[N], undiscounted.
+        length: int[N], environment steps.
+        score: float[N], the share of the task that was done by the end; None for tasks that are done or not.
     """
 
     success: jax.Array
@@ -48,33 +48,31 @@ def evaluate(
         horizon: environment steps per decision.
     """
 
-    def one(state: State) -> tuple[State, Episodes]:
+    def one(state: State) -> tuple[State, jax.Array, jax.Array, jax.Array]:
         latent = choose(state.obs)
         state, result = macro_step(env, lambda observation: play(observation, latent), state, horizon, 1.0)
-        return state, Episodes(result.success, result.episode_return, result.steps, result.score)
+        return state, result.success, result.episode_return, result.steps
 
     def going(carry: tuple[State, Episodes]) -> jax.Array:
         return jnp.any(carry[0].done < 0.5)
 
     def body(carry: tuple[State, Episodes]) -> tuple[State, Episodes]:
         state, totals = carry
-        state, found = jax.vmap(one)(state)
+        state, success, episode_return, steps = jax.vmap(one)(state)
         totals = Episodes(
-            jnp.maximum(totals.success, found.success),
-            totals.episode_return + found.episode_return,
-            totals.length + found.length,
-            None if totals.score is None or found.score is None else jnp.maximum(totals.score, found.score),
+            jnp.maximum(totals.success, success), totals.episode_return + episode_return, totals.length + steps
         )
         return state, totals
 
     start = jax.vmap(env.reset)(jax.random.split(key, episodes))
-    zeros, score = jnp.zeros(episodes), jnp.zeros(episodes) if "score" in start.metrics else None
-    nothing = Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32), score)
-    return jax.lax.while_loop(going, body, (start, nothing))[1]
+    zeros = jnp.zeros(episodes)
+    first = Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32))
+    state, totals = jax.lax.while_loop(going, body, (start, first))
+    return totals._replace(score=state.metrics.get("score"))  # a state stays as it was when its episode was over
 
 
 def summary(episodes: Episodes) -> dict[str, np.ndarray]:
-    """Return columns of metrics.csv, [members] each, of episodes[members, N]; "eval/score" for tasks with parts."""
+    """Return columns of metrics.csv, [members] each, of episodes[members, N]."""
     success = np.asarray(episodes.success)
     score = {} if episodes.score is None else {"eval/score": np.asarray(episodes.score).mean(axis=-1)}
     return score | {

@@ -20,7 +20,6 @@ class MacroStep(NamedTuple):
         steps: live environment steps, 1 to H.
         episode_return: undiscounted sum of rewards over the live steps.
         success: 1 if the goal was reached.
-        score: the largest share of the task that was done; None for tasks that have no parts (``metrics["score"]``).
         finite: False if the simulation broke; such a step must not be learned from.
     """
 
@@ -30,7 +29,6 @@ class MacroStep(NamedTuple):
     steps: jax.Array
     episode_return: jax.Array
     success: jax.Array
-    score: jax.Array | None
     finite: jax.Array
 
 
@@ -57,13 +55,12 @@ def macro_step(
             steps=result.steps + alive.astype(jnp.int32),
             episode_return=result.episode_return + live * new.reward,
             success=jnp.maximum(result.success, live * new.metrics["success"]),
-            score=None if result.score is None else jnp.maximum(result.score, live * new.metrics["score"]),
             finite=result.finite & (finite | ~alive),
         )
         return (jax.tree.map(lambda a, b: jnp.where(alive, a, b), new, state), result), None
 
-    zero, score = jnp.zeros(()), jnp.zeros(()) if "score" in state.metrics else None
-    start = MacroStep(zero, jnp.ones(()), state.obs, jnp.zeros((), jnp.int32), zero, zero, score, jnp.ones((), bool))
+    zero = jnp.zeros(())
+    start = MacroStep(zero, jnp.ones(()), state.obs, jnp.zeros((), jnp.int32), zero, zero, jnp.ones((), bool))
     (state, result), _ = jax.lax.scan(step, (state, start), jnp.arange(horizon))
     return state, result
 

@@ -19,11 +19,11 @@ from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
 from qdos_brax.report.study import Study, format_value, short_key
 
 TICKS = 8  # the most values of a scan that all get a label on its axis
-_MEASURES = (("eval/success", "success"), ("eval/score", "score"), ("eval/return", "return"))
+MEASURES = (("eval/success", "success"), ("eval/score", "score"), ("eval/return", "return"))
 
 
 def draw_curves(study: Study, out: Path) -> None:
-    """Draw success, score (of tasks with parts) and return over the environment steps, a row of panels per task.
+    """Draw success, return and, where a task has one, the score over the environment steps, a row of panels per task.
 
     A thick line is the mean of a setting's members, the band its 95 % bootstrap interval, a thin line a member. A
     dashed horizontal line is a method that only learned offline.
@@ -35,12 +35,15 @@ def draw_curves(study: Study, out: Path) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    tasks, shown = len(study.tasks), measures(study)
-    size = (5.5 * len(shown), 4 * tasks)
-    figure, axes = plt.subplots(tasks, len(shown), figsize=size, layout="constrained", squeeze=False)
+    tasks = len(study.tasks)
+    scored = any(curves(study, task, "eval/score") for task in study.tasks)
+    measures = [(column, name) for column, name in MEASURES if name != "score" or scored]
+    figure, axes = plt.subplots(
+        tasks, len(measures), figsize=(5.5 * len(measures), 4 * tasks), layout="constrained", squeeze=False
+    )
     colours = setting_colours(study)
     for row, task in zip(axes, study.tasks, strict=True):
-        for axis, (column, name) in zip(row, shown, strict=True):
+        for axis, (column, name) in zip(row, measures, strict=True):
             for curve in curves(study, task, column):
                 _draw_curve(axis, curve, colours[curve.setting.label])
             axis.set_xlabel("environment steps")
@@ -65,12 +68,6 @@ def draw_scans(study: Study, out: Path) -> bool:
         _draw_scan(axis, scan)
     save_figure(figure, out)
     return True
-
-
-def measures(study: Study) -> list[tuple[str, str]]:
-    """Return the columns of metrics.csv that have a curve, with their names; the score if any run has one."""
-    scored = any("eval/score" in row for run in study.runs for member in run.members for row in member.rows)
-    return [(column, name) for column, name in _MEASURES if scored or name != "score"]
 
 
 def setting_colours(study: Study) -> dict[str, str]:

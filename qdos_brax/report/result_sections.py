@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from qdos_brax.report.curves import TICKS, axis_positions, measures, setting_colours
+from qdos_brax.report.curves import MEASURES, TICKS, axis_positions, setting_colours
 from qdos_brax.report.elements import (
     PALETTE,
     Figure,
@@ -73,16 +73,16 @@ def _mean_and_members(setting: Setting, task: str, colour: str) -> Iterable[Trac
 
 
 def learning_section(study: Study) -> Section:
-    """Return a chart per task and measure: success, score (of tasks with parts) and return over steps."""
+    """Return a chart per task and measure: success, score and return over the environment steps."""
     colours = setting_colours(study)
     figures = [
         Figure(
             title_with_task(study, name, task),
             [trace for curve in drawn for trace in _curve(curve, colours[curve.setting.label])],
-            axis_layout("environment steps", name, share=name != "return"),
+            axis_layout("environment steps", name, share=name in ("success", "score")),
         )
         for task in study.tasks
-        for column, name in measures(study)
+        for column, name in MEASURES
         for drawn in [curves(study, task, column)]
         if drawn
     ]

@@ -1,24 +1,22 @@
-"""Define what plays the episodes of a collected set, and find it by the family of the task."""
+"""What a scripted demonstrator is: a program that plays a task by itself, in NumPy, for its offline data."""
 
 from __future__ import annotations
 
-import importlib
-from typing import Any, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from envs.task import Task
-from qdos_brax.errors import UserError
 
 
 class SimStates(NamedTuple):
-    """Hold n simulations before a control step, in NumPy.
+    """Hold n simulations before a control step, in NumPy; a demonstrator reads these arrays and changes none.
 
     Attributes:
-        qpos: float64[n, nq].
-        qvel: float64[n, nv].
-        extra: int32[n, e], the discrete state.
-        sensed: float32[n, k], what the rig senses.
+        qpos: float64[n, nq], exact; at the start of an episode what ``begin`` returned, rounded to float32.
+        qvel: float64[n, nv], likewise.
+        extra: int32[n, e], the discrete state; e may be 0.
+        sensed: float32[n, k], what the task's rig senses, errors included; k may be 0.
     """
 
     qpos: np.ndarray
@@ -28,48 +26,53 @@ class SimStates(NamedTuple):
 
 
 class Demonstrator(Protocol):
-    """Play episodes in n simulations at once, in NumPy."""
+    """Play episodes in n simulations at once, in NumPy.
+
+    A class is registered by the name of its family of tasks (``qdos_brax.collection.scripted``). What it remembers
+    between two steps (a plan, a goal, a counter) it keeps itself; ``begin`` forgets all of it, since one demonstrator
+    plays many episodes, one after another. All its random numbers come from the generators it is given.
+
+    Args:
+        env: the task; the set serves all tasks of its variant, so that goals are the demonstrator's own choice.
+        n: simulations played at once, the n of all arrays.
+        noise: standard deviation of the Gaussian noise on actions, in units of the action, but for noisy episodes.
+
+    Attributes:
+        version: raised whenever the same arguments give other actions or starts; part of the default sets' names.
+        heavy_noise: standard deviation of the action noise in noisy episodes.
+    """
+
+    version: ClassVar[int]
+    heavy_noise: ClassVar[float]
+
+    def __init__(self, env: Task, n: int, noise: float) -> None: ...
 
     def begin(self, kinds: np.ndarray, rng: np.random.Generator) -> SimStates:
-        """Return the starts of n episodes; the caller fills in ``sensed``.
+        """Start an episode in every simulation and return where it starts.
 
         Args:
-            kinds: int8[n], the behaviour in each, codes of ``qdos_brax.data.quality.QUALITY``.
-            rng: what all chances are drawn from.
+            kinds: int8[n], the behaviour of each episode, codes of ``qdos_brax.data.quality.QUALITY``.
+            rng: what the starts, and the demonstrator's own choices, are drawn from.
+
+        Returns:
+            The states. qpos and qvel are rounded to float32, as every start of the engine is. The caller senses:
+            ``sensed`` may be anything here, such as an array of size 0, and is whole in what ``act`` gets.
         """
         ...
 
     def act(self, states: SimStates, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Return (actions float32[n, act] within [-1, 1], noise included; quality int8[n] of this very step)."""
+        """Return the next action of every simulation.
+
+        It is called once per control step of the episodes that ``begin`` started, which last as long as the caller
+        likes, success or not.
+
+        Args:
+            states: before the step.
+            rng: what action noise and choices are drawn from.
+
+        Returns:
+            actions: float32[n, act] within [-1, 1], noise included.
+            quality: int8[n], codes of ``QUALITY``: the behaviour in this very step, which may be better or worse than
+                that of the episode.
+        """
         ...
-
-
-_DEMONSTRATORS: dict[str, str] = {
-    "cube": "qdos_brax.collection.scripted.tabletop:TabletopDemonstrator",
-    "kitchen": "qdos_brax.collection.scripted.kitchen:KitchenDemonstrator",
-    "scene": "qdos_brax.collection.scripted.tabletop:TabletopDemonstrator",
-}
-"""By family, the class as "module:name", called with (task, noise); imported on first use."""
-
-
-def has_demonstrator(family: str) -> bool:
-    """Return whether ``family`` is collected by a script."""
-    return family in _DEMONSTRATORS
-
-
-def demonstrator_of(env: Task, noise: float) -> Demonstrator:
-    """Return what plays the task's episodes.
-
-    Args:
-        env: the task.
-        noise: standard deviation of the action noise of episodes that are not degraded.
-
-    Raises:
-        UserError: there is none for the task's family.
-    """
-    if env.spec.family not in _DEMONSTRATORS:
-        raise UserError(f"no demonstrator is shipped for {env.spec.family}; train with --dataset FILE")
-    module, _, name = _DEMONSTRATORS[env.spec.family].partition(":")
-    make: Any = getattr(importlib.import_module(module), name)
-    made: Demonstrator = make(env, noise)
-    return made

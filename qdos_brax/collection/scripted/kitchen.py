@@ -14,7 +14,6 @@ from qdos_brax.collection.scripted.kitchen_arm import Arm, Poses, Target
 from qdos_brax.collection.scripted.kitchen_skills import DOWN, FORWARD, SKILLS, Look, Targets, beside, move, pause
 from qdos_brax.data.quality import QUALITY
 
-HEAVY_NOISE = 0.6  # standard deviation of the action noise of noisy episodes
 SEQUENCE_SHARE = {"mixed": 0.0, "partial": 0.3, "complete": 1.0}
 """Share of the episodes, by variant, that do the task's four subtasks one after another."""
 
@@ -35,18 +34,21 @@ class KitchenDemonstrator:
 
     Args:
         env: the task.
+        n: simulations played at once.
         noise: standard deviation of the action noise of all episodes but the noisy ones.
     """
 
-    def __init__(self, env: Kitchen, noise: float) -> None:
+    version = 1
+    heavy_noise = 0.6
+
+    def __init__(self, env: Kitchen, n: int, noise: float) -> None:
         self._env, self._noise = env, noise
-        self._arm = Arm(env)
+        self._arm, self._poses = Arm(env), Poses(env, n)
 
     def begin(self, kinds: np.ndarray, rng: np.random.Generator) -> SimStates:
         """Return the task's start, n times, and plan an episode of ``kinds[n]`` for each."""
         n = len(kinds)
         self._kinds = kinds.astype(np.int8)
-        self._poses = Poses(self._env, n)
         looks = [
             Look(self._poses, index, own, pace=own.uniform(*_PACES), hesitation=_HESITATION)
             for index, own in enumerate(rng.spawn(n))
@@ -59,7 +61,7 @@ class KitchenDemonstrator:
         """Return (actions float32[n, 9], quality int8[n]): an episode is of one quality."""
         self._poses.look(states.qpos, states.qvel, states.extra)
         actions = self._arm.actions(self._poses, [next(play) for play in self._plays])
-        noise = np.where(self._kinds == QUALITY["noisy"], HEAVY_NOISE, self._noise)
+        noise = np.where(self._kinds == QUALITY["noisy"], self.heavy_noise, self._noise)
         actions += noise[:, None] * rng.standard_normal((len(actions), JOINTS))
         return np.clip(actions, -1.0, 1.0).astype(np.float32), self._kinds.copy()
 

@@ -26,7 +26,7 @@ def own(env: Any) -> list[int]:
 
 def test_each_subtask_is_completed_by_its_skill_alone() -> None:
     env = make("mixed")
-    demonstrator = KitchenDemonstrator(env, NOISE)
+    demonstrator = KitchenDemonstrator(env, len(SUBTASKS), NOISE)
     plans = iter([[name] for name in SUBTASKS])
     demonstrator._plan = lambda rng: next(plans)  # type: ignore[method-assign]
     *steps, (last, _, _) = play(env, demonstrator, np.zeros(len(SUBTASKS), np.int8), steps=150)
@@ -39,7 +39,8 @@ def test_plans_show_all_four_subtasks_where_the_variant_says_so_and_only_there()
     rng = np.random.default_rng(0)
     for variant, low, high in (("mixed", 0, 0), ("partial", 0.2, 0.4), ("complete", 1, 1)):
         env = make(variant)
-        plans = [KitchenDemonstrator(env, NOISE)._plan(rng) for _ in range(200)]
+        demonstrator = KitchenDemonstrator(env, 1, NOISE)
+        plans = [demonstrator._plan(rng) for _ in range(200)]
         assert all(len(set(plan)) == len(plan) >= 6 and set(plan) <= set(SUBTASKS) for plan in plans)
         shown = [set(env.subtasks) <= set(plan) for plan in plans]
         assert low <= np.mean(shown) <= high
@@ -51,7 +52,7 @@ def test_plans_show_all_four_subtasks_where_the_variant_says_so_and_only_there()
 def test_kinds_differ_in_noise_and_progress_and_every_step_says_what_it_is() -> None:
     env = make("partial")
     kinds = np.repeat(np.int8([QUALITY["navigate"], QUALITY["noisy"], QUALITY["wander"], QUALITY["fail"]]), 3)
-    *steps, (last, _, _) = play(env, KitchenDemonstrator(env, NOISE), kinds, steps=100, seed=1)
+    *steps, (last, _, _) = play(env, KitchenDemonstrator(env, len(kinds), NOISE), kinds, steps=100, seed=1)
     for _, _, quality in steps:
         np.testing.assert_array_equal(quality, kinds)
     done = last.extra.sum(axis=1).reshape(4, 3).mean(axis=1)
@@ -63,7 +64,9 @@ def test_kinds_differ_in_noise_and_progress_and_every_step_says_what_it_is() -> 
 def test_the_same_seed_plays_the_same_episodes() -> None:
     env, kinds = make("mixed"), np.int8([0, 3])
     first, again, other = (
-        [action for _, action, _ in play(env, KitchenDemonstrator(env, NOISE), kinds, steps=15, seed=seed)][:-1]
+        [action for _, action, _ in play(env, KitchenDemonstrator(env, len(kinds), NOISE), kinds, steps=15, seed=seed)][
+            :-1
+        ]
         for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(first, again)
@@ -76,7 +79,7 @@ def test_the_same_seed_plays_the_same_episodes() -> None:
 )
 def test_whole_episodes_do_most_of_what_they_plan(variant: str, all_four: float, own_mean: float) -> None:
     env = make(variant)
-    *_, (last, _, _) = play(env, KitchenDemonstrator(env, NOISE), np.zeros(48, np.int8), env.episode_length)
+    *_, (last, _, _) = play(env, KitchenDemonstrator(env, 48, NOISE), np.zeros(48, np.int8), env.episode_length)
     done = last.extra[:, own(env)]
     share = done.all(axis=1).mean()
     assert share == 0 if variant == "mixed" else share >= all_four
