@@ -25,11 +25,11 @@ def test_every_family_loads_with_every_preset(family: str, preset: str, tmp_path
     assert hash(config) == hash(configs.from_yaml(path))
 
 
-@pytest.mark.parametrize("name", [*envs.ALIASES, *dict.fromkeys(spec.name for spec in envs.list_tasks())])
+@pytest.mark.parametrize("name", dict.fromkeys([*envs.ALIASES, *(spec.name for spec in envs.list_tasks())]))
 def test_every_task_takes_the_layers_of_its_family(name: str) -> None:
     family = envs.get_spec(name).family
     layers = configs.run_layers(name, "paper")
-    alpha = {"kitchen": 0.2}.get(family, 0.3)  # the paper's
+    alpha = {"kitchen": 0.2, "cube": 0.2, "scene": 0.2}.get(family, 0.3)  # the paper's
     assert layers[0].name == f"configs/{family}.yaml" and layers[0].values["skills.alpha"] == alpha
     assert load_config(name, "paper").env == name
 
