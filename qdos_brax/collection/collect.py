@@ -1,29 +1,75 @@
-"""Collection of a task's offline data: episodes of repeated navigation, by a recipe (``qdos_brax.collection.recipes``).
+"""Collection of a task's offline data: whole episodes by a recipe (``qdos_brax.collection.recipes``).
 
-An episode starts at random free cells and runs for a fixed number of steps, whether it reaches a goal or not: the body
-is sent along a shortest path to a random free cell (soccer: it brings the ball there), and on arrival to another. All
-tasks of a maze share the same data; only rewards and masks depend on the task.
+An episode runs for a fixed number of steps, whether it reaches a goal or not. All tasks of a variant, such as a maze,
+share the same data; only rewards and masks depend on the task.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
-import jax
 import numpy as np
 
-from qdos_brax.collection.collector import CHUNK_STEPS, Collector
-from qdos_brax.collection.recipes import episode_kinds
+from envs.task import Task
+from qdos_brax.collection.recipes import CollectionRecipe, episode_kinds
 from qdos_brax.errors import UserError
-
-COLLECTION_VERSION = 5
-"""Version of the collected rows: raised when the same arguments give other rows. Part of the default sets' names."""
 
 SHORTEST_EPISODE = 200
 
 
+class EpisodeCollector(Protocol):
+    """Collect whole episodes of a task, many at once."""
+
+    @property
+    def env(self) -> Task:
+        """Return the task."""
+
+    @property
+    def recipe(self) -> CollectionRecipe:
+        """Return what is collected."""
+
+    @property
+    def version(self) -> int:
+        """Return a number that is raised when the same arguments give other rows; part of the default sets' names."""
+
+    @property
+    def expert_id(self) -> str:
+        """Return what identifies who acts; part of the default sets' names."""
+
+    @property
+    def chunk_steps(self) -> int:
+        """Return what the length of an episode has to be a multiple of, in control steps."""
+
+    def episodes(
+        self, kinds: np.ndarray, length: int, seed: int, turn: int, progress: Callable[[int], None] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return the rows of n episodes, one after another; the same arguments give the same rows.
+
+        Args:
+            kinds: int8[n], the behaviour in each, see ``recipes.BEHAVIOURS``.
+            length: control steps of an episode, a multiple of ``chunk_steps``.
+            seed: seed of the whole collection.
+            turn: how many times the n were collected before; other turns have other random numbers.
+            progress: called with the number of rows so far, now and then.
+
+        Returns:
+            arrays[n * length, ..] by their name in the file: observations, actions, next_observations, timeouts,
+            infos/qpos, infos/qvel, infos/quality, and infos/extra where the task has a discrete state.
+        """
+        ...
+
+
+class _Visited(NamedTuple):
+    """Hold the simulator states of all rows, as ``Task.labels`` takes them."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    extra: np.ndarray | None
+
+
 def collect(
-    collector: Collector,
+    collector: EpisodeCollector,
     transitions: int,
     seed: int,
     num_envs: int = 64,
@@ -32,11 +78,11 @@ def collect(
     """Collect ``transitions`` rows; the same arguments on the same machine give the same rows.
 
     Args:
-        collector: task, recipe and expert.
+        collector: task, recipe and who acts.
         transitions: number of rows, at least SHORTEST_EPISODE.
         seed: seed of all random numbers.
         num_envs: environments stepped at once (fewer when there are not enough episodes).
-        progress: called as ``progress(rows so far, rows)`` after every chunk.
+        progress: called as ``progress(rows so far, rows)`` now and then.
 
     Returns:
         Rows in D4RL's flat layout, keyed as in the file (``infos/qpos``), with true ``next_observations``. No row is
@@ -47,22 +93,20 @@ def collect(
         UserError: an argument is out of range.
     """
     check_size(transitions, seed, num_envs)
-    env, recipe = collector.env, collector.recipe
-    length = recipe.episode_steps or episode_length(transitions, num_envs, env.episode_length)
+    env, recipe, chunk = collector.env, collector.recipe, collector.chunk_steps
+    length = recipe.episode_steps or episode_length(transitions, num_envs, env.episode_length, chunk)
     episodes = -(-transitions // length)
     rounds = -(-episodes // num_envs)
     width = -(-episodes // rounds)
     kinds = episode_kinds(recipe.mix, rounds * width, seed).reshape(rounds, width)
     parts: list[dict[str, np.ndarray]] = []
     for index in range(rounds):
-        reset_key, step_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
         report = None if progress is None else _offset(progress, index * width * length, transitions)
-        states = collector.reset(jax.random.split(reset_key, width))
-        parts.append(collector.run(states, kinds[index], length, step_key, report)[0])
+        parts.append(collector.episodes(kinds[index], length, seed, index, report))
     rows = {name: np.concatenate([part[name] for part in parts])[:transitions] for name in parts[0]}
     rows["timeouts"][-1] = True
-    success = np.asarray(env.success(rows["infos/qpos"], env.goal_xy))
-    rows["rewards"] = success.astype(np.float32) - 1.0
+    states = _Visited(rows["infos/qpos"], rows["infos/qvel"], rows.get("infos/extra"))
+    rows["rewards"] = np.asarray(env.labels(states)[0], np.float32)
     rows["terminals"] = np.zeros(transitions, bool)
     return rows
 
@@ -75,9 +119,9 @@ def check_size(transitions: int, seed: int, num_envs: int) -> None:
         raise UserError(f"seed must be 0 or more and num_envs 1 or more, got {seed} and {num_envs}")
 
 
-def episode_length(transitions: int, num_envs: int, cap: int) -> int:
+def episode_length(transitions: int, num_envs: int, cap: int, chunk: int) -> int:
     """Return the steps of an episode: the task's ``cap``, or fewer so that a small set uses all environments."""
-    return min(max(transitions // num_envs, SHORTEST_EPISODE), cap) // CHUNK_STEPS * CHUNK_STEPS
+    return min(max(transitions // num_envs, SHORTEST_EPISODE), cap) // chunk * chunk
 
 
 def _offset(progress: Callable[[int, int], None], done: int, total: int) -> Callable[[int], None]:

@@ -35,9 +35,16 @@ class Collector:
         recipe: what is collected.
         expert: the body's expert (soccer: a dribbler); None loads the shipped one.
 
+    Attributes:
+        version: of the rows, raised when the same arguments give others; part of the default sets' names.
+        chunk_steps: what the length of an episode is a multiple of.
+
     Raises:
         UserError: no expert is shipped for the body.
     """
+
+    version = 5
+    chunk_steps = CHUNK_STEPS
 
     def __init__(self, env: MazeTask, recipe: CollectionRecipe, expert: policies.Expert | None = None) -> None:
         self.env, self.recipe, self.profile = env, recipe, profile_of(env)
@@ -45,6 +52,23 @@ class Collector:
         self._dribbler = self.expert if isinstance(self.expert, policies.DribblingExpert) else None
         self._walker = policies.walker_of(self.expert)
         self.planner = Planner(env, recipe, self._dribbler is not None)
+
+    @property
+    def expert_id(self) -> str:
+        """Return eight hex digits that identify the expert's weights."""
+        return policies.digest(self.expert)
+
+    def episodes(
+        self, kinds: np.ndarray, length: int, seed: int, turn: int, progress: Callable[[int], None] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return the rows of n episodes from random starts, one after another; see ``EpisodeCollector``.
+
+        The body is sent along a shortest path to a random free cell (soccer: it brings the ball there), and on arrival
+        to another, unless the recipe wants something else.
+        """
+        reset_key, step_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), turn))
+        states = self.reset(jax.random.split(reset_key, len(kinds)))
+        return self.run(states, kinds, length, step_key, progress)[0]
 
     def run(
         self,

@@ -1,4 +1,4 @@
-"""Default data sets: collected once per machine, kept in a folder, shared by all tasks of a maze."""
+"""Default data sets: collected once per machine, kept in a folder, shared by all tasks of a variant, such as a maze."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ import mujoco
 import numpy as np
 
 import qdos_brax
-from envs.mazes.maze_task import MazeTask
+from envs.task import Task
 from qdos_brax.collection import recipes
-from qdos_brax.collection.collect import COLLECTION_VERSION, check_size, collect
-from qdos_brax.collection.collector import Collector
-from qdos_brax.collection.experts import policies
-from qdos_brax.collection.profiles import profile_of
+from qdos_brax.collection.collect import EpisodeCollector, check_size, collect
+from qdos_brax.collection.makers import maker_of
 from qdos_brax.data import formats
 from qdos_brax.data.cache import folder, locked
 from qdos_brax.data.quality import QUALITY
@@ -23,14 +21,14 @@ from qdos_brax.runs.progress import Progress
 
 
 def default_dataset(
-    env: MazeTask, transitions: int, degraded_share: float, noise: float, seed: int, num_envs: int = 64
+    env: Task, transitions: int, degraded_share: float, noise: float, seed: int, num_envs: int = 64
 ) -> Path:
     """Return the path of the set with these parameters; collect it if it does not exist.
 
     If two processes ask at once, one collects and the other waits. A file under this name is always complete.
 
     Args:
-        env: the task; the set serves its whole maze, since rows are labelled when they are read.
+        env: the task; the set serves its whole variant, such as a maze, since rows are labelled when they are read.
         transitions: number of rows.
         degraded_share: share of degraded episodes.
         noise: standard deviation of the action noise of the others.
@@ -38,24 +36,23 @@ def default_dataset(
         num_envs: environments stepped at once.
 
     Raises:
-        UserError: a parameter is out of range, no expert is shipped for the body, or the folder cannot be written.
+        UserError: a parameter is out of range, nobody collects the task's data, or the folder cannot be written.
     """
-    profile = profile_of(env)
-    expert = profile.expert()
-    recipe = recipes.degraded(degraded_share, profile, noise)
+    maker = maker_of(env)
+    collector = maker.collector(recipes.degraded(degraded_share, maker, noise))
     parameters = f"n{transitions}-bad{degraded_share:g}-noise{noise:g}-seed{seed}-envs{num_envs}"
-    version = f"{env.backend}-v{COLLECTION_VERSION}-{policies.digest(expert)}"
+    version = f"{env.backend}-v{collector.version}-{collector.expert_id}"
     path = folder() / f"{env.spec.name}-{parameters}-{version}.hdf5"
     if path.exists():
         return path
     with locked(path):
         if not path.exists():  # another process may have made it while this one waited
             print(f"no data for {env.spec.name} yet: collecting {transitions:,} steps into {path}", flush=True)
-            make_file(path, Collector(env, recipe, expert), transitions, seed, num_envs)
+            make_file(path, collector, transitions, seed, num_envs)
     return path
 
 
-def make_file(path: Path, collector: Collector, transitions: int, seed: int, num_envs: int) -> None:
+def make_file(path: Path, collector: EpisodeCollector, transitions: int, seed: int, num_envs: int) -> None:
     """Collect a set with a progress bar and write it to ``path``, with its origin as attributes.
 
     Args:
@@ -75,7 +72,7 @@ def make_file(path: Path, collector: Collector, transitions: int, seed: int, num
     formats.write_hdf5(path, rows, _attributes(collector, rows) | {"seed": seed, "num_envs": num_envs})
 
 
-def _attributes(collector: Collector, rows: dict[str, np.ndarray]) -> dict[str, Any]:
+def _attributes(collector: EpisodeCollector, rows: dict[str, np.ndarray]) -> dict[str, Any]:
     """Return the file's attributes: how the rows were collected, and what they contain."""
     env, recipe = collector.env, collector.recipe
     counts = np.bincount(rows["infos/quality"], minlength=len(QUALITY)) / len(rows["infos/quality"])
@@ -86,9 +83,9 @@ def _attributes(collector: Collector, rows: dict[str, np.ndarray]) -> dict[str, 
         "noise": recipe.noise,
         "heavy_noise": recipe.heavy_noise,
         "physics": env.backend,
-        "expert": policies.digest(collector.expert),
+        "expert": collector.expert_id,
         "composition": " ".join(f"{name}={counts[code]:.3f}" for name, code in QUALITY.items()),
-        "version": COLLECTION_VERSION,
+        "version": collector.version,
         "packages": f"qdos-brax {qdos_brax.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}",
     }
     return attributes | ({"falls": _falls(rows)} if "infos/fell" in rows else {})

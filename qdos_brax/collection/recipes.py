@@ -1,13 +1,15 @@
 """Recipes for collecting data: OGBench's for mazes and soccer, and mixtures of good and degraded behaviour.
 
 Every episode follows one behaviour: ``expert`` goes to goals (soccer: brings the ball there), ``noisy`` does so under
-heavy action noise, ``wander`` walks in random directions, ``fail`` turns round half-way and goes back.
+heavy action noise, ``wander`` walks in random directions, ``fail`` turns round half-way and goes back. What they are
+where nothing walks, the task's demonstrator says.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -22,6 +24,14 @@ NAMES = ("navigate", "stitch", "explore", "mixed")
 
 NOISE = 0.2  # standard deviation of the action noise, as in OGBench; the experts succeed under it
 EXPLORE_STEPS = 500  # control steps of an episode of explore
+
+
+class HeavyNoise(Protocol):
+    """Give the action noise of noisy episodes: a body's profile, or who makes the collectors of a task."""
+
+    @property
+    def heavy_noise(self) -> float:
+        """Return its standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +58,7 @@ class CollectionRecipe:
     heading_seconds: float | None = None
 
 
-def mixed(mix: Mapping[str, float], body: CollectionProfile, noise: float = NOISE) -> CollectionRecipe:
+def mixed(mix: Mapping[str, float], body: HeavyNoise, noise: float = NOISE) -> CollectionRecipe:
     """Return the recipe for a mixture of behaviours, with goals anywhere.
 
     Raises:
@@ -66,7 +76,7 @@ def mixed(mix: Mapping[str, float], body: CollectionProfile, noise: float = NOIS
     return CollectionRecipe("mixed", mix, noise, body.heavy_noise)
 
 
-def degraded(share: float, body: CollectionProfile, noise: float = NOISE) -> CollectionRecipe:
+def degraded(share: float, body: HeavyNoise, noise: float = NOISE) -> CollectionRecipe:
     """Return the default sets' recipe: ``share`` of the episodes is degraded, each bad behaviour in equal parts.
 
     Raises:

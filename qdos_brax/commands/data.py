@@ -10,9 +10,8 @@ import numpy as np
 
 import envs
 from qdos_brax.collection import recipes
-from qdos_brax.collection.collector import Collector
 from qdos_brax.collection.default_set import make_file
-from qdos_brax.collection.profiles import profile_of
+from qdos_brax.collection.makers import CollectorMaker, maker_of
 from qdos_brax.config import Config, check_method, load_config
 from qdos_brax.data import checks, download, formats, sources
 from qdos_brax.data.dataset import episode_bounds
@@ -36,7 +35,7 @@ def add_parser(commands: Any) -> None:
         "--recipe",
         choices=recipes.NAMES,
         default="mixed",
-        help="OGBench's navigate, stitch or explore, or a mixture of good and bad behaviour (default mixed)",
+        help="in mazes OGBench's navigate, stitch or explore; or a mixture of good and bad behaviour (default mixed)",
     )
     make.add_argument(
         "--mix", metavar="M", help="mixed: share of each behaviour, such as expert=0.3,noisy=0.3,wander=0.2,fail=0.2"
@@ -92,26 +91,25 @@ def _make(args: argparse.Namespace) -> int:
     path = Path(args.out).expanduser()
     if path.suffix not in (".hdf5", ".h5"):
         raise UserError(f"--out {args.out}: data is written as .hdf5; give the file that ending")
-    env = _env(args.task, args.physics)
-    make_file(path, Collector(env, _recipe(args, env)), args.transitions, args.seed, args.num_envs)
+    maker = maker_of(_env(args.task, args.physics))
+    make_file(path, maker.collector(_recipe(args, maker)), args.transitions, args.seed, args.num_envs)
     print(path)
     return 0
 
 
-def _recipe(args: argparse.Namespace, env: envs.Task) -> recipes.CollectionRecipe:
-    body = profile_of(env)
+def _recipe(args: argparse.Namespace, maker: CollectorMaker) -> recipes.CollectionRecipe:
     if args.recipe != "mixed":
         if args.mix is not None or args.degraded_share is not None:
             raise UserError(
                 f"--recipe {args.recipe} takes neither --mix nor --degraded-share; use them with --recipe mixed"
             )
-        return recipes.named(args.recipe, body, args.noise)
+        return maker.named(args.recipe, args.noise)
     noise = recipes.NOISE if args.noise is None else args.noise
     if args.mix is None:
-        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, body, noise)
+        return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, maker, noise)
     if args.degraded_share is not None:
         raise UserError("--mix and --degraded-share both set the mixture; give one of them")
-    return recipes.mixed(recipes.parse_mix(args.mix), body, noise)
+    return recipes.mixed(recipes.parse_mix(args.mix), maker, noise)
 
 
 def _fetch(args: argparse.Namespace) -> int:

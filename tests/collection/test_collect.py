@@ -120,7 +120,7 @@ def test_a_humanoid_that_fell_begins_anew_on_its_feet() -> None:
     [(200, 64, 200), (4_000, 16, 250), (64_000, 64, 1000), (1_000_000, 64, 1000)],
 )
 def test_small_sets_have_shorter_episodes(transitions: int, num_envs: int, length: int) -> None:
-    assert episode_length(transitions, num_envs, 1000) == length
+    assert episode_length(transitions, num_envs, 1000, CHUNK_STEPS) == length
 
 
 @pytest.mark.parametrize("wrong", [{"transitions": 10}, {"num_envs": 0}, {"seed": -1}])

@@ -19,6 +19,7 @@ from flax import struct
 from envs.physics.base import PipelineState
 from envs.physics.host_function import HostFunction
 from envs.physics.mujoco.rig import Rig
+from envs.physics.mujoco.simulations import Simulations
 from envs.physics.mujoco.stepper import BatchStepper, with_changes
 
 _SENSORS = 0x5E50
@@ -103,6 +104,10 @@ class MujocoEngine:
         )
         carry = MujocoCarry(bits=bits, fresh=jnp.zeros_like(state.carry.fresh), key=key)
         return PipelineState(qpos, qvel, sensed, extra[0] if extra else state.extra, carry, state.steps + 1)
+
+    def simulations(self, rng: np.random.Generator) -> Simulations:
+        """Return simulations to be started and stepped outside jax; ``rng`` is what the sensors' errors come from."""
+        return Simulations(self._stepper, self._rig, rng)
 
     def exact_state(self, state: PipelineState) -> tuple[np.ndarray, np.ndarray]:
         """Return the float64 (qpos[..., nq], qvel[..., nv]) behind a stepped state; for parity tests, outside jit."""
