@@ -139,6 +139,9 @@ def test_completed_subtasks_are_state_that_can_be_given_and_decide_reward_and_su
     rows: Any = SimpleNamespace(qpos=None, extra=extra)
     for labelled in (env.labels(rows), env.labels(SimpleNamespace(qpos=None, extra=jnp.asarray(extra)))):
         np.testing.assert_array_equal(labelled, [[-4, -3, 0], [1, 1, 0]])
+    done = {name: value.tolist() for name, value in env.parts(rows).items()}
+    assert done.pop("microwave") == [False, True, True] and set(done) == set(env.subtasks[1:])
+    assert list(done.values()) == [[False, False, True]] * 3
     assert kitchen("kitchen-partial").score(extra).tolist() == [0, 0.25, 1]
 
 
