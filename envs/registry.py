@@ -32,9 +32,10 @@ def register_family(name: str, family: Family) -> None:
     if family.default_variant not in family.variants:
         raise ValueError(f"family {name!r} has no variant {family.default_variant!r} to take by default")
     FAMILIES[name] = family
-    if family.default_variant:
-        task = "" if family.alias_task is None else f"-task{family.alias_task}"
-        ALIASES[name] = f"{name}-{family.default_variant}{task}"
+    variant = f"-{family.default_variant}" if family.default_variant else ""
+    task = "" if family.alias_task is None else f"-task{family.alias_task}"
+    if variant or task:
+        ALIASES[name] = f"{name}{variant}{task}"
 
 
 def list_tasks() -> list[TaskSpec]:
@@ -61,7 +62,7 @@ def get_spec(name: str) -> TaskSpec:
     full_name = f"{base}-task{task_id}"
     if full_name in specs:
         return specs[full_name]
-    known = [*ALIASES, *dict.fromkeys(spec.name for spec in specs.values()), *specs]
+    known = [*dict.fromkeys([*ALIASES, *(spec.name for spec in specs.values())]), *specs]
     near = max(known, key=lambda other: difflib.SequenceMatcher(None, other, name).ratio())
     raise ValueError(f"there is no task {name!r}; did you mean {near!r}? (tasks: {', '.join(known[: -len(specs)])})")
 

@@ -1,6 +1,7 @@
 #!/bin/sh
 # Builds the wheel into dist/, installs it into an environment made from nothing, and runs the smoke preset with it from
-# a folder outside the tree: what is missing in the wheel is missing there. PYTHON names the interpreter.
+# a folder outside the tree: what is missing in the wheel is missing there. An argument names another interpreter than
+# python3.
 set -eu
 
 root=$(cd "$(dirname "$0")/.." && pwd)
@@ -11,7 +12,7 @@ unset PYTHONPATH
 set -x
 cd "$root"
 rm -rf build dist  # a file of an earlier build would go into the wheel
-"${PYTHON:-python3}" -m venv "$outside/venv"
+"${1:-python3}" -m venv "$outside/venv"
 "$outside/venv/bin/pip" wheel --quiet --no-deps --wheel-dir dist .
 "$outside/venv/bin/pip" install --quiet -c constraints.txt dist/*.whl
 

@@ -58,7 +58,7 @@ def test_help_waits_for_no_jax(call: str) -> None:
         ("--env antmaze --preset cpu --steps 0", "high_level.env_steps must be at least 1"),
         ("--env antmaze --preset cpu --physics mujco", "did you mean 'mujoco'"),
         ("--env antmaze --preset cpu --method qdso", "did you mean 'qdos'"),
-        ("--env cube-single", "no task 'cube-single'; did you mean"),
+        ("--env cube-tripple", "no task 'cube-tripple'; did you mean"),
         ("--env antmaze-huge --preset cpu", "no task 'antmaze-huge'; did you mean"),
         ("--env antmaze --preset cpu --dataset /nowhere.npz --out {tmp}/run", "/nowhere.npz: no such file"),
     ],

@@ -81,7 +81,7 @@ def test_a_group_shows_its_own_keys_alone(capsys: pytest.CaptureFixture[str]) ->
         ("skils --preset cpu", "there is no key 'skils', did you mean 'skills'?"),
         ("alpha --preset cpu", "did you mean 'skills.alpha'?"),
         ("skills.alhpa --preset cpu", "did you mean 'skills.alpha'?"),
-        ("--env cube-single --preset cpu", "there is no task 'cube-single'"),
+        ("--env cube-tripple --preset cpu", "there is no task 'cube-tripple'"),
         ("--method nosuch --preset cpu", "there is no method 'nosuch'"),
         ("--preset cpuu", "did you mean 'cpu'?"),
         ("skills.alpha --preset cpu --set skills.alpha=-1", "skills.alpha must be at least 0"),

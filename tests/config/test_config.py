@@ -29,7 +29,7 @@ def test_every_family_loads_with_every_preset(family: str, preset: str, tmp_path
 def test_every_task_takes_the_layers_of_its_family(name: str) -> None:
     family = envs.get_spec(name).family
     layers = configs.run_layers(name, "paper")
-    alpha = {"kitchen": 0.2}.get(family, 0.3)  # the paper's
+    alpha = 0.2 if family in ("cube", "kitchen", "scene") else 0.3  # the paper's
     assert layers[0].name == f"configs/{family}.yaml" and layers[0].values["skills.alpha"] == alpha
     assert load_config(name, "paper").env == name
 
@@ -147,7 +147,7 @@ def test_wrong_settings_are_one_line(text: str, message: str) -> None:
 def test_unknown_names_propose_the_nearest() -> None:
     with pytest.raises(UserError, match="did you mean 'antmaze-large'"):
         load_config("antmase-large", "cpu")
-    for name in ("cube-single", "kitchen-huge", "antmaze-huge", "antmaze-medium-task9"):  # a YAML alone makes no task
+    for name in ("cube-tripple", "kitchen-huge", "antmaze-huge", "antmaze-medium-task9"):  # a YAML alone makes no task
         with pytest.raises(UserError, match=f"there is no task '{name}'") as caught:
             configs.load_programs(name, "cpu")
         assert "\n" not in str(caught.value)

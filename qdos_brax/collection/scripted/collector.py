@@ -74,11 +74,21 @@ class ScriptedCollector:
     def episodes(
         self, kinds: np.ndarray, length: int, seed: int, turn: int, progress: Callable[[int], None] | None = None
     ) -> dict[str, np.ndarray]:
-        """Return the rows of n episodes, one after another; see ``EpisodeCollector``."""
+        """Return the rows of n episodes, one after another; see ``EpisodeCollector``.
+
+        Raises:
+            ValueError: the demonstrator's actions leave [-1, 1].
+            UserError: a simulation broke, and its states are no numbers.
+        """
         own, sensors = np.random.default_rng([seed, turn]).spawn(2)
         simulations = self._engine.simulations(sensors)
         demonstrator = self._demonstrator(len(kinds))
-        return self._rows(_play(demonstrator, simulations, kinds, length, own, progress))
+        played = _play(demonstrator, simulations, kinds, length, own, progress)
+        if not (np.abs(played.actions) <= 1.0).all():
+            raise ValueError(f"{self.expert_id} acts outside [-1, 1], or with what is no number")
+        if not (np.isfinite(played.qpos).all() and np.isfinite(played.qvel).all()):
+            raise UserError(f"a simulation of {self.env.spec.name} broke while it was demonstrated; use another --seed")
+        return self._rows(played)
 
     def _rows(self, played: _Played) -> dict[str, np.ndarray]:
         """Return the rows by their name in the file."""

@@ -172,6 +172,30 @@ def test_who_plays_what() -> None:
         ScriptedCollector(elsewhere, recipes.degraded(0.5, ReacherDemonstrator))
 
 
+@pytest.mark.parametrize(
+    ("start", "action", "message"),
+    [
+        (0.0, 1.01, "acts outside"),
+        (0.0, np.nan, "acts outside"),
+        (np.nan, 1.0, "simulation of reacher broke .* another --seed"),
+    ],
+)
+def test_what_is_no_demonstration_is_no_data(
+    start: float, action: float, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Broken(ReacherDemonstrator):
+        def begin(self, kinds: np.ndarray, rng: np.random.Generator) -> SimStates:
+            return super().begin(kinds, rng)._replace(qpos=np.full((self.n, 2), start))
+
+        def act(self, states: SimStates, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+            return np.full((self.n, 2), action, np.float32), np.zeros(self.n, np.int8)
+
+    monkeypatch.setitem(scripted.DEMONSTRATORS, "reacher", Broken)
+    with pytest.raises(ValueError if start == 0 else UserError, match=message):
+        default_set.make_file(tmp_path / "set.hdf5", collector(), 200, 0, 2)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_default_set_is_collected_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
