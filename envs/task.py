@@ -93,8 +93,8 @@ class Task(Env, ABC):
     ``step`` never resets: see ``envs.AutoReset``.
 
     What not every task can do has a member all the same, which is None where the task cannot: ``position``,
-    ``floor_map``, ``distance_left``, ``resting``, ``body_frame``. Maps, paths, reports and checks leave out what is
-    None.
+    ``floor_map``, ``distance_left``, ``parts``, ``resting``, ``body_frame``. Maps, paths, reports and checks leave out
+    what is None.
 
     Args:
         spec: which task.
@@ -241,6 +241,10 @@ class Task(Env, ABC):
 
         A way in units of length, or a count of what is still to be done; inf where there is no way.
         """
+        return None
+
+    def parts(self, states: SimulatorStates) -> Mapping[str, Any] | None:
+        """Return bool[...] by name, which parts of the task are done in ``states``; None for tasks without parts."""
         return None
 
     def resting(self, qpos: np.ndarray) -> Resting | None:

@@ -109,6 +109,10 @@ class Kitchen(Task):
         """Return float64[...], how many of the four are left."""
         return np.asarray(4.0 * (1.0 - self.score(extra)), np.float64)
 
+    def parts(self, states: SimulatorStates) -> dict[str, Any]:
+        """Return bool[...] for each of the four, whether it was completed."""
+        return {name: states.extra[..., place] == 1 for name, place in zip(self.subtasks, self._places, strict=True)}
+
     def scene(self) -> Scene:
         """Return the whole kitchen, from behind the arm or from closer to the things that it moves."""
         kitchen = fixed_view((-0.2, 0.5, 1.9), azimuth=70.0, elevation=-30.0, distance=2.8)

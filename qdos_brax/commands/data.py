@@ -190,6 +190,9 @@ def _check(args: argparse.Namespace) -> int:
     reached = sum(1 for first, stop in episodes if (dataset.masks[first:stop] == 0).any())
     print(f"{args.file} fits {env.spec.full_name}: {dataset.size:,} transitions, {len(episodes):,} episodes")
     print(f"{reached:,} episodes reach the goal; {np.mean(dataset.masks == 0):.2%} of the rows are at it")
+    if (parts := env.parts(dataset)) is not None:
+        counts = {name: sum(1 for first, stop in episodes if done[first:stop].any()) for name, done in parts.items()}
+        print(f"episodes with each part: {', '.join(f'{name} {count:,}' for name, count in counts.items())}")
     return 0
 
 

@@ -17,7 +17,7 @@ from qdos_brax.data.quality import QUALITY
 SEQUENCE_SHARE = {"mixed": 0.0, "partial": 0.3, "complete": 1.0}
 """Share of the episodes, by variant, that do the task's four subtasks one after another."""
 
-_PACES = (0.85, 1.2)  # range of the factor on every speed
+_PACES = (0.9, 1.3)  # range of the factor on every speed
 _HESITATION = 0.04  # probability of a pause before a move
 _TRIES = 3  # of a subtask
 _WORKSPACE = np.array([[-0.75, 0.25, 1.75], [0.45, 0.72, 2.5]])  # m, where a wandering hand goes
@@ -38,7 +38,7 @@ class KitchenDemonstrator:
         noise: standard deviation of the action noise of all episodes but the noisy ones.
     """
 
-    version = 1
+    version = 2
     heavy_noise = 0.6
 
     def __init__(self, env: Kitchen, n: int, noise: float) -> None:

@@ -115,10 +115,10 @@ def pause(look: Look, steps: int, grip: bool) -> Targets:
 def kettle(look: Look) -> Targets:
     """Move the kettle to the back, pushed low and in its middle."""
     x, y, z = look.qpos(23), look.qpos(24), 1.69
-    yield from move(look, np.array([x, y - 0.20, z + 0.17]), grip=False, within=0.03, rotation=DOWN)
+    yield from move(look, np.array([x, y - 0.20, z + 0.17]), grip=False, within=0.03, steps=40, rotation=DOWN)
     yield from move(look, np.array([x, y - 0.18, z]), grip=False, rotation=DOWN)
     pushed = np.array([x + 0.02, 0.58, z])
-    far_enough = lambda: look.qpos(24) > 0.55  # noqa: E731
+    far_enough = lambda: look.qpos(24) > 0.50  # noqa: E731
     yield from move(look, pushed, grip=False, within=0.02, steps=40, speed=0.03, rotation=DOWN, until=far_enough)
     yield from move(look, np.array([x, 0.30, z + 0.08]), grip=False, within=0.05, steps=10, rotation=DOWN)
     yield from move(look, np.array([x, 0.22, z + 0.25]), within=0.06, steps=10)
@@ -142,7 +142,7 @@ def microwave(look: Look) -> Targets:
     pull = lambda: on_arc(look.qpos(22) - 0.1) + 0.036 * ahead  # noqa: E731
     is_open = lambda: look.qpos(22) < -0.57  # noqa: E731
     slipped = lambda: is_open() or (look.tip - here()) @ look.hand[:, 2] < 0.006  # noqa: E731
-    yield from move(look, away, grip=False, within=0.025)
+    yield from move(look, away, grip=False, within=0.025, steps=45)
     for _ in range(5):
         yield from move(look, grasp, grip=False, within=0.010, steps=12, speed=0.03, until=is_open)
         yield from move(look, grasp, within=0.0, steps=3, until=is_open)
@@ -172,7 +172,7 @@ def light_switch(look: Look) -> Targets:
     """Move the switch to the left."""
     at = look.site("light_site")
     on = lambda: look.qpos(17) < -0.66  # noqa: E731
-    yield from move(look, beside(at, 0.10, -0.10, 0.0), within=0.02)
+    yield from move(look, beside(at, 0.10, -0.10, 0.0), within=0.02, steps=40)
     yield from move(look, beside(at, 0.07, 0.005, 0.0), within=0.012, steps=15)
     yield from move(look, beside(at, -0.09, 0.02, 0.0), steps=20, speed=0.03, until=on)
     yield from move(look, beside(at, -0.04, -0.10, 0.0), within=0.03, steps=10)
