@@ -10,7 +10,7 @@ from envs.manipulation.manipspace import SHIFT, ManipSpaceTask, TableState
 from envs.manipulation.manipspace_rig import ROBOT_JOINTS
 from qdos_brax.collection.scripted.demonstrator import SimStates
 from qdos_brax.collection.scripted.oracles import MOVE, Oracle
-from qdos_brax.collection.scripted.table import TableView, TableReader
+from qdos_brax.collection.scripted.table import TableReader, TableView
 from qdos_brax.collection.scripted.targets import LYING, GoalSeeker, any_target
 
 AIMED_SHARE = 0.75

@@ -39,7 +39,7 @@ class Oracle:
         self._steps = 0
 
     def set_target(self, table: TableView, target: Target, rng: np.random.Generator) -> None:
-        """Begin with a target; ``rng`` draws the times of the plan, its way, and where the hand goes in the end."""
+        """Start with a target; ``rng`` draws the times of the plan, its way, and where the hand goes in the end."""
         self._target, self._steps = target, 0
         self._oracle = _oracle_class(self._style, target.kind)(env=self._env)
         with _numpy_draws_from(rng):
