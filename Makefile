@@ -1,7 +1,7 @@
 # See CONTRIBUTING.md.
 PYTHON = .venv/bin/python
 
-.PHONY: setup quick test check format ci
+.PHONY: setup quick test check format ci docs dist
 
 setup:
 	python3 -m venv .venv
@@ -24,3 +24,11 @@ format:
 
 ci:
 	.ci/run
+
+docs:
+	$(PYTHON) tools/configuration_page.py
+	$(PYTHON) tools/concept_pictures.py
+	$(PYTHON) -m mkdocs build --strict
+
+dist:
+	tools/release_check.sh

@@ -25,7 +25,7 @@ from qdos_brax.data import formats, quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
-from qdos_brax.methods.build import make_skill_model, value_phase
+from qdos_brax.methods.low_level_kinds import make_skill_model, value_phase
 from qdos_brax.population.members import Population
 from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.skills.graph_phase import GraphPhase

@@ -28,6 +28,7 @@ import mujoco
 import numpy as np
 
 import envs
+from envs.mazes.families import MAZE_FAMILIES
 from qdos_brax.collection.experts import policies
 from qdos_brax.files import write_text
 
@@ -221,7 +222,7 @@ def examine(task: str) -> dict[str, Any]:
 def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = list(dict.fromkeys(spec.name for spec in envs.list_tasks()))
+    names = list(dict.fromkeys(s.name for s in envs.list_tasks() if s.family in MAZE_FAMILIES))
     parser.add_argument("--tasks", nargs="+", default=names)
     parser.add_argument("--out", type=Path, help="JSON file for the result; its entries of other tasks are kept")
     args = parser.parse_args()

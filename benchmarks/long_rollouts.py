@@ -27,6 +27,7 @@ import mujoco
 import numpy as np
 
 import envs
+from envs.mazes.families import MAZE_FAMILIES
 from envs.mazes.walls import cells_in_reach
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.views import direction_of
@@ -183,7 +184,7 @@ def span(values: np.ndarray) -> dict[str, float]:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = list(dict.fromkeys(spec.name for spec in envs.list_tasks()))
+    names = list(dict.fromkeys(s.name for s in envs.list_tasks() if s.family in MAZE_FAMILIES))
     parser.add_argument("--tasks", nargs="+", default=names, help="tasks (default all)")
     parser.add_argument("--physics", nargs="+", default=["mujoco", "mjx"], help="engines (default mujoco mjx)")
     parser.add_argument("--out", type=Path, help="JSON file to update; entries of other tasks and engines are kept")

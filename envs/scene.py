@@ -48,8 +48,11 @@ def top_view(centre: Sequence[float], half_size: Sequence[float], height: float)
     return partial(_top_camera, tuple(centre), tuple(half_size), height)
 
 
-def following_view(body: int, azimuth: float = 90.0, elevation: float = -50.0, distance: float = 10.0) -> View:
-    """Return a view that follows the body with the id ``body``; angles in degrees, distance in m."""
+def following_view(body: int, azimuth: float = 90.0, elevation: float = -72.0, distance: float = 10.0) -> View:
+    """Return a view that follows the body with the id ``body``; angles in degrees, distance in m.
+
+    It is steep by default, so that a maze's walls, half a cell high, hide little of what walks between them.
+    """
     return partial(_following_camera, body, azimuth, elevation, distance)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -91,8 +93,8 @@ class Task(Env, ABC):
     ``step`` never resets: see ``envs.AutoReset``.
 
     What not every task can do has a member all the same, which is None where the task cannot: ``position``,
-    ``floor_map``, ``distance_left``, ``resting``, ``body_frame``. Maps, paths, reports and checks leave out what is
-    None.
+    ``floor_map``, ``distance_left``, ``parts``, ``resting``, ``body_frame``. Maps, paths, reports and checks leave out
+    what is None.
 
     Args:
         spec: which task.
@@ -104,11 +106,13 @@ class Task(Env, ABC):
         jump: distance that the first two numbers of an observation, a position then, never move in one control step;
             None where they are no position. Readers of data files find unmarked ends of episodes by it.
         body_frame: which numbers of an observation move and turn with the body.
+        unfit: why known files of the same scene cannot be used, by their numbers per observation.
     """
 
     distance_margin = 0.0
     jump: float | None = None
     body_frame: BodyFrame | None = None
+    unfit: Mapping[int, str] = MappingProxyType({})
 
     def __init__(self, spec: TaskSpec, engine: Engine, goal: Any = ()) -> None:
         self.spec = spec
@@ -237,6 +241,10 @@ class Task(Env, ABC):
 
         A way in units of length, or a count of what is still to be done; inf where there is no way.
         """
+        return None
+
+    def parts(self, states: SimulatorStates) -> Mapping[str, Any] | None:
+        """Return bool[...] by name, which parts of the task are done in ``states``; None for tasks without parts."""
         return None
 
     def resting(self, qpos: np.ndarray) -> Resting | None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 import sys
 import time
 from collections.abc import Callable, Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,12 +25,12 @@ from qdos_brax.analysis.finished import trained_run
 from qdos_brax.collection.default_set import default_dataset
 from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
-from qdos_brax.data import download, formats, relocation
+from qdos_brax.data import download, formats, origin, relocation
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.requirements import remarks
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
-from qdos_brax.methods.build import bind_phases, build_context, build_phases, plan_members
+from qdos_brax.methods.build import bind_phases, build_context, build_phases, check_skills, plan_members
 from qdos_brax.population.members import Population
 from qdos_brax.runs import comparison, observers, shares, signals
 from qdos_brax.runs.checkpoint import Artifacts
@@ -43,8 +40,6 @@ from qdos_brax.runs.hints import resume_command, resume_flag
 from qdos_brax.runs.hosts import ALONE, Hosts
 from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.runs.loop import run_phases
-
-_PACKAGES = ("brax", "flax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "orbax-checkpoint")
 
 
 class _Data(NamedTuple):
@@ -89,6 +84,8 @@ def start(
     for config in asked.values():
         configs.check_method(config)
     env = _make_env(first)
+    for config in asked.values():
+        check_skills(config, env)
     if hosts.count > 1 and len(asked) > 1:
         raise UserError("--distributed shares the members of one run; give one method and one value of each size")
     if len(asked) == 1:
@@ -252,7 +249,7 @@ def _train(
     Returns:
         The configuration with the members of a program as planned, the summary, and what was learned.
     """
-    _record_origin(folder, data)
+    origin.record(folder, data.path, data.sha256, config.skills_file)
     load_beside()
     context = build_context(config, data.env, data.dataset)
     phases = build_phases(context)
@@ -299,20 +296,6 @@ def _data_file(config: Config, env: Any) -> tuple[Path, str | None]:
         num_envs=data.num_envs,
     )
     return path, None
-
-
-def _record_origin(folder: RunFolder, data: _Data) -> None:
-    """Write run.json: command, data and packages; on resume, refuse other data than at the start."""
-    if folder.provenance.exists():
-        relocation.check_same(folder, data.path, data.sha256)
-        return
-    content = {
-        "command": sys.argv,
-        "dataset": {"path": str(data.path.absolute()), "sha256": data.sha256},
-        "python": platform.python_version(),
-        "packages": {name: metadata.version(name) for name in _PACKAGES},
-    }
-    write_text(folder.provenance, json.dumps(content, indent=2) + "\n")
 
 
 def _announce(config: Config, asked: Config, chosen: bool) -> None:

@@ -13,7 +13,7 @@ import envs
 from envs import render
 from qdos_brax import config as configs
 from qdos_brax.high_level.sac import SAC
-from qdos_brax.methods.build import make_skill_model
+from qdos_brax.methods.low_level_kinds import make_skill_model
 from qdos_brax.runs.checkpoint import CheckpointStore, Position
 from qdos_brax.runs.folder import RunFolder
 

@@ -1,20 +1,29 @@
-"""README and docs: links lead somewhere, commands parse, the README stays short."""
+"""README and docs: links lead somewhere, commands parse, generated pages are fresh, the README stays short."""
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from qdos_brax.commands.main import main_parser
 from qdos_brax.commands.train import configs_from_args, train_parser
+from qdos_brax.config import load_config
+from qdos_brax.config.methods import METHODS
+from tools import concept_pictures, configuration_page
 
 pytestmark = pytest.mark.quick
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
 FENCED = re.compile(r"^```[^\n]*\n(.*?)^```", re.M | re.S)
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
@@ -44,6 +53,60 @@ def test_links_lead_somewhere(page: Path) -> None:
         target = (page.parent / name).resolve() if name else page
         assert target.exists(), f"{page.name} links to {link}"
         assert not anchor or anchor in anchors(target), f"{page.name} links to {link}"
+
+
+def in_nav(entry: Any) -> list[str]:
+    """The files of an entry of mkdocs.yml's nav."""
+    if isinstance(entry, str):
+        return [entry]
+    return [name for part in (entry.values() if isinstance(entry, dict) else entry) for name in in_nav(part)]
+
+
+def test_every_page_is_in_the_sites_nav_once() -> None:
+    nav = in_nav(yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"])
+    assert sorted(nav) == sorted(path.name for path in DOCS.glob("*.md"))
+
+
+def test_pages_of_the_site_link_only_to_what_it_holds() -> None:
+    for page in DOCS.glob("*.md"):
+        assert not [link for link in LINK.findall(page.read_text(encoding="utf-8")) if link.startswith("..")], page
+
+
+def test_the_page_of_the_configuration_is_that_of_the_schema() -> None:
+    """Else: python tools/configuration_page.py."""
+    assert (DOCS / "configuration.md").read_text(encoding="utf-8") == configuration_page.page()
+
+
+@pytest.mark.parametrize("name", concept_pictures.PICTURES)
+def test_the_pictures_of_the_concepts_are_those_of_their_script(name: str) -> None:
+    """Else: python tools/concept_pictures.py."""
+    assert (DOCS / name).read_text(encoding="utf-8") == concept_pictures.PICTURES[name]()
+
+
+def test_the_method_of_the_page_can_be_added() -> None:
+    (block,) = re.findall(r"^```python\n(.*?)^```", (DOCS / "add-a-method.md").read_text(encoding="utf-8"), re.M | re.S)
+    before = dict(METHODS)
+    try:
+        exec(block, {})
+        config = load_config("antmaze-medium", "smoke", {"method": "diverse"})
+        assert METHODS["diverse"].information and not METHODS["diverse"].weighted
+        assert config.skills.alpha == 0.5 and config.labels.offline_reward == "data"
+    finally:
+        METHODS.clear()
+        METHODS.update(before)
+
+
+@pytest.mark.slow
+def test_the_site_builds_strictly(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason='no mkdocs: pip install -c constraints.txt -e ".[docs]"')
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    built = subprocess.run(command, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True)
+    assert built.returncode == 0, built.stderr.decode()
+    pages = sorted((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > 15
+    for page in pages:  # nothing is fetched: no scripts, styles or fonts of others
+        text = page.read_text(encoding="utf-8")
+        assert not re.findall(r"""<(?:script|link|img)[^>]*(?:src|href)=["']?https?://""", text), page
 
 
 @pytest.mark.parametrize("line", commands("python train.py "))

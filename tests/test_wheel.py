@@ -8,6 +8,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from qdos_brax.commands.main import main
 
@@ -37,3 +39,28 @@ def test_the_console_command_is_there() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     module, _, function = project["scripts"]["qdos"].partition(":")
     assert getattr(importlib.import_module(module), function) is main
+
+
+@pytest.mark.quick
+def test_the_container_copies_what_its_builder_is_given() -> None:
+    lines = (ROOT / "Dockerfile").read_text(encoding="utf-8").splitlines()
+    copied = [name for line in lines if line.startswith("COPY ") for name in line.split()[1:-1]]
+    assert {"pyproject.toml", "constraints.txt", "configs", "envs", "qdos_brax"} <= set(copied)
+    assert [name for name in copied if not (ROOT / name).exists()] == []
+    given = {line.removeprefix("!") for line in (ROOT / ".dockerignore").read_text().splitlines() if line[:1] == "!"}
+    assert given == set(copied)
+    assert lines.index("USER qdos") < next(i for i, line in enumerate(lines) if line.startswith("CMD"))
+
+
+@pytest.mark.quick
+def test_every_dependency_is_pinned_within_its_range() -> None:
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines if "==" in line)}
+    assert lines[1:] == sorted(lines[1:], key=str.lower) and len(pins) == len(lines) - 1
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for text in [
+        *project["dependencies"],
+        *(text for extra in project["optional-dependencies"].values() for text in extra),
+    ]:
+        wanted = Requirement(text)
+        assert wanted.specifier.contains(pins[canonicalize_name(wanted.name)]), text

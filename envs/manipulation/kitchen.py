@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -39,13 +40,21 @@ class Kitchen(Task):
     Args:
         spec: which task.
         physics: "mujoco".
+
+    Attributes:
+        subtasks: the four, by name.
+        arm: the arm's limits and its sensors' errors.
     """
 
     distance_margin = 0.5
+    unfit = MappingProxyType(
+        {60: "D4RL's kitchen: 30 positions and the goal, neither velocities nor simulator states; use data make"}
+    )
 
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         model = stepped_model()
-        super().__init__(spec, MujocoEngine(model, KitchenRig(arm_config(model.nv)), FRAME_SKIP))
+        self.arm = arm_config(model.nv)
+        super().__init__(spec, MujocoEngine(model, KitchenRig(self.arm), FRAME_SKIP))
         self.subtasks = _OF_VARIANT[spec.variant]
         self._places = np.array([SUBTASKS.index(name) for name in self.subtasks])
 
@@ -99,6 +108,10 @@ class Kitchen(Task):
     def distance_left(self, qpos: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
         """Return float64[...], how many of the four are left."""
         return np.asarray(4.0 * (1.0 - self.score(extra)), np.float64)
+
+    def parts(self, states: SimulatorStates) -> dict[str, Any]:
+        """Return bool[...] for each of the four, whether it was completed."""
+        return {name: states.extra[..., place] == 1 for name, place in zip(self.subtasks, self._places, strict=True)}
 
     def scene(self) -> Scene:
         """Return the whole kitchen, from behind the arm or from closer to the things that it moves."""

@@ -59,6 +59,8 @@ def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[
 def _result(member: Mapping[str, Any]) -> str:
     success, first = member["eval_success"], member["first_goal_step"]
     result = "not evaluated" if success is None else f"success {success:.2f} (best {member['best_success']:.2f})"
+    if "eval_score" in member:
+        result += f", {100 * member['eval_score']:.0f} % of the task's parts done"
     if first is not None:
         result += f", first goal after {first:,} env steps"
     elif not member["best_success"]:  # an offline method reaches goals without a step online

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 import envs
 from envs.render import NoOpenGL, Renderer, steps_per_second
@@ -80,11 +79,6 @@ class EpisodeRunner:
 def on_mujoco_c(trained: TrainedRun) -> TrainedRun:
     """Return the run with its task on MuJoCo C: a few episodes are not worth MJX's compilation."""
     return trained._replace(env=envs.make(trained.config.env, physics="mujoco"))
-
-
-def evenly_spaced(count: int, total: int) -> np.ndarray:
-    """Return int[<= count], different places among ``total``, the first and the last one included."""
-    return np.unique(np.linspace(0, total - 1, count).round().astype(int))
 
 
 def of_member(trained: TrainedRun, member: int) -> tuple[Any, Any]:

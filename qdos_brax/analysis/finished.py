@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.errors import FlaxError
 
 import envs
 from qdos_brax import config as configs
@@ -19,10 +20,12 @@ from qdos_brax.errors import UserError
 from qdos_brax.high_level.agent import Agent, Policy
 from qdos_brax.high_level.evaluation import evaluate
 from qdos_brax.high_level.sac import SAC
-from qdos_brax.methods.build import make_low_level, make_policy
+from qdos_brax.methods.build import make_policy
+from qdos_brax.methods.low_level_kinds import make_low_level
 from qdos_brax.offline.flat_policy import FlatPolicy
 from qdos_brax.population.members import Population
 from qdos_brax.runs.checkpoint import final_artifacts
+from qdos_brax.runs.export import read_export
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import resume_command
 
@@ -46,20 +49,43 @@ class TrainedRun(NamedTuple):
 
 
 def load_run(run: Path) -> TrainedRun:
-    """Read the agents of a finished run from its folder.
+    """Read the agents of a finished run from its folder, or from the file that it was exported to.
 
     Args:
-        run: the run folder.
+        run: the run folder or the file.
 
     Raises:
-        UserError: it is no run folder, or the run has not finished.
+        UserError: it is neither, the run has not finished, or the file cannot be trusted.
     """
+    if run.is_file():
+        return _exported_run(run)
     folder = RunFolder.open(str(run))
     config = configs.from_yaml(folder.config)
     if folder.read_summary() is None:
         raise UserError(f"the run in {run} has not finished; continue it with: {resume_command(run)}")
     env = envs.make(config.env, physics=config.physics)
     return trained_run(config, env, final_artifacts(folder.checkpoints, configs.config_hash(config)))
+
+
+def _exported_run(path: Path) -> TrainedRun:
+    config, found = read_export(path)
+    try:
+        env = envs.make(config.env, physics=config.physics)
+    except ValueError as error:  # a task or an engine that this machine does not have
+        raise UserError(f"{path}: {error}") from error
+    trained = trained_run(config, env, found.arrays)
+    try:
+        jax.eval_shape(lambda: _decide(trained))
+    except (FlaxError, LookupError, TypeError, ValueError) as error:
+        raise UserError(f"{path} is damaged: its arrays do not fit its configuration") from error
+    return trained
+
+
+def _decide(trained: TrainedRun) -> jax.Array:
+    """Return the first member's action at a blank observation."""
+    artifacts, hyper = jax.tree.map(lambda leaf: leaf[0], (trained.artifacts, trained.hyper))
+    agent, observation = trained.agent(artifacts, hyper), jnp.zeros(trained.env.observation_size)
+    return agent.play(observation, agent.choose(observation))
 
 
 def trained_run(config: Config, env: Any, artifacts: Any) -> TrainedRun:
@@ -105,11 +131,12 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
     """Play whole episodes with the agents of a finished run.
 
     Args:
-        run: the run folder.
+        run: the run folder, or the file that it was exported to.
         episodes: episodes per member.
 
     Returns:
-        One dict per member: seed, alpha, and whatever else varies, success (0..1), return, length, episodes.
+        One dict per member: seed, alpha, and whatever else varies, success (0..1), return, length, episodes, and
+        score (0..1) where a task has one.
 
     Raises:
         UserError: it is no run folder, or the run has not finished.
@@ -128,6 +155,8 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
         "return": np.asarray(result.episode_return).mean(axis=-1),
         "length": np.asarray(result.length).mean(axis=-1),
     }
+    if result.score is not None:
+        means["score"] = np.asarray(result.score).mean(axis=-1)
     return [
         {**member, **{name: float(value[index]) for name, value in means.items()}, "episodes": episodes}
         for index, member in enumerate(members)

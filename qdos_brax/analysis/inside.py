@@ -12,16 +12,16 @@ import numpy as np
 from sklearn.manifold import TSNE  # type: ignore[import-untyped]
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from envs.render import NoOpenGL, Renderer
 from qdos_brax import config as configs
-from qdos_brax.analysis.film import EpisodeRunner, evenly_spaced, of_member, on_mujoco_c
+from qdos_brax.analysis.film import EpisodeRunner, of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun, evaluation_key
+from qdos_brax.analysis.pictures import draw_episode
 from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.data.device import DeviceData, to_device
+from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.data.segments import window
 from qdos_brax.files import write_arrays
-from qdos_brax.methods.build import make_low_level
+from qdos_brax.methods.low_level_kinds import make_low_level
 from qdos_brax.skills.vae import Segments
 from qdos_brax.skills.weights import advantage_weights
 
@@ -31,8 +31,6 @@ _GRID = 5  # skills along each of the two main directions of the latents
 _SPREAD = 2.0  # how far the grid extends along them, in standard deviations
 _BETWEEN = 9  # skills on the line from one to another
 _HELD = 3  # the time that a skill is kept for on the map, in lengths of a segment
-_FRAMES = 6
-_FRAME_HEIGHT = 240
 _SEED = 0  # of the sample of segments, and of t-SNE
 
 Arrays = dict[str, np.ndarray]
@@ -56,6 +54,7 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
         m/path, m/left, m/latents: float[T, 2], float[T], float[K, z]: an evaluation episode: positions, the
             distance left to the goal, and the latent of each decision.
         m/frames, m/frame_steps: uint8[F, height, width, 3], int[F], pictures of the scene at some of its steps.
+        m/film, m/film_speed: uint8[bytes], float[], the episode as a WebP, and how many times as fast it plays.
         goal, walls: float[2], float[W, 2], the goal and the centres of the wall cells.
 
     Args:
@@ -99,7 +98,8 @@ class _Sample(NamedTuple):
 
 def _sample(trained: TrainedRun, dataset: Dataset) -> _Sample:
     """Draw random segments, the same ones for every method on the same data."""
-    data, _ = to_device(dataset, trained.config.skills.horizon)
+    normaliser = Normaliser(**jax.tree.map(lambda leaf: leaf[0], trained.artifacts["normaliser"]))  # all have the same
+    data, _ = to_device(dataset, trained.config.skills.horizon, normaliser)
     total = data.starts.shape[0]
     chosen = np.sort(np.random.default_rng(_SEED).choice(total, min(_SEGMENTS, total), replace=False))
     return _Sample(dataset, data, chosen, np.asarray(data.starts)[chosen])
@@ -244,18 +244,11 @@ def _episode(trained: TrainedRun, runner: EpisodeRunner, member: int) -> Arrays:
             latents.append(np.asarray(decision)[:width])
         physics = state.pipeline_state
         states.append(tuple(map(np.asarray, (physics.qpos, state.info["goal"], physics.extra))))
-    qpos, _, extra = map(np.stack, zip(*states, strict=True))
+    qpos, goals, extra = map(np.stack, zip(*states, strict=True))
     found: Arrays = {"latents": np.stack(latents)}
     left = trained.env.distance_left(qpos, extra)
     if left is not None:
         found["left"] = np.asarray(left, np.float32)
     if trained.env.floor_map() is not None:
         found["path"] = _place_of_body(trained.env, qpos).astype(np.float32)
-    steps = evenly_spaced(_FRAMES, len(states))
-    try:
-        with Renderer(trained.env, _FRAME_HEIGHT) as renderer:
-            found["frames"] = np.stack([renderer.frame(*states[step][:2]) for step in steps])
-            found["frame_steps"] = steps
-    except NoOpenGL:  # a page without frames is better than none
-        pass
-    return found
+    return found | draw_episode(trained.env, qpos, goals)

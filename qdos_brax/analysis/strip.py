@@ -11,8 +11,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from envs.render import NoOpenGL, Renderer, steps_per_second
-from qdos_brax.analysis.film import EpisodeRunner, evenly_spaced, on_mujoco_c
+from qdos_brax.analysis.film import EpisodeRunner, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun, load_run
+from qdos_brax.analysis.pictures import evenly_spaced, near_camera
 from qdos_brax.errors import UserError
 from qdos_brax.report.curves import save_figure
 from qdos_brax.report.member_analysis import read_analyses
@@ -21,7 +22,6 @@ from qdos_brax.report.study import read_study
 
 _FRAMES = 4
 _HEIGHT = 300  # pixels of a frame
-_CAMERA = "follow"  # where there is one: the body is seen, not only its place
 
 
 def draw_run(run: Path, out: Path) -> None:
@@ -57,9 +57,8 @@ def _frames(trained: TrainedRun) -> list[tuple[float, np.ndarray]]:
     env, episode = trained.env, EpisodeRunner(trained).episode(0)
     states = [(np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal"])) for state, _ in episode]
     rate = steps_per_second(env)
-    camera = _CAMERA if _CAMERA in env.scene().cameras else None
     try:
-        with Renderer(env, _HEIGHT, _HEIGHT, camera) as renderer:
+        with Renderer(env, _HEIGHT, _HEIGHT, near_camera(env)) as renderer:
             return [(step / rate, renderer.frame(*states[step])) for step in evenly_spaced(_FRAMES, len(states))]
     except NoOpenGL as error:
         raise UserError(str(error)) from error

@@ -67,15 +67,15 @@ def _lines(keys: Sequence[str], programs: Sequence[Config], layers: Sequence[Lay
             yield f"\n# {group}: {groups()[group]}"
         origins = _origins(key, layers)
         meaning = get_field(key).metadata["meaning"]
-        yield f"{key} = {_text(_values(programs, key))}  (set by {origins[-1][0]})"
+        yield f"{key} = {written(_values(programs, key))}  (set by {origins[-1][0]})"
         yield from textwrap.wrap(meaning, _WIDTH, initial_indent=_INDENT, subsequent_indent=_INDENT)
-        yield f"{_INDENT}accepts {_accepted(key)}"
+        yield f"{_INDENT}accepts {accepted(key)}"
         if history:
-            yield from (f"{_INDENT}{_text(value)} in {name}" for name, value in origins)
+            yield from (f"{_INDENT}{written(value)} in {name}" for name, value in origins)
 
 
-def _accepted(key: str) -> str:
-    """Return what a key accepts, and its flag if a mark of its field names one."""
+def accepted(key: str) -> str:
+    """Return in words what a key accepts, and its flag if a mark of its field names one."""
     marks = get_field(key).metadata
     scan = ["a list makes a scan"] if marks["scan"] else []
     flags = [f"flag --{marks['label']}"] if marks["label"] else ["flag --pretrain-steps"] if marks["pretrain"] else []
@@ -94,7 +94,8 @@ def _origins(key: str, layers: Sequence[Layer]) -> list[tuple[str, Any]]:
     return [("default", get_field(key).default), *above]
 
 
-def _text(value: Any) -> str:
+def written(value: Any) -> str:
+    """Return a value as the user would write it."""
     if isinstance(value, list | tuple):
-        return ", ".join(f"[{_text(item)}]" if isinstance(item, list | tuple) else _text(item) for item in value)
+        return ", ".join(f"[{written(item)}]" if isinstance(item, list | tuple) else written(item) for item in value)
     return str(value).lower() if value is None or isinstance(value, bool) else str(value)

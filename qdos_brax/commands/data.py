@@ -1,4 +1,4 @@
-"""``python -m qdos_brax data``: make, fetch, describe and check data files."""
+"""``python -m qdos_brax data``: make, fetch, describe, check and export data files."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _UNUSABLE = 2  # exit code, as for every error that the user can fix
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``data make | fetch | info | check`` to the subparsers ``commands``; set the handlers as ``run``."""
-    data = commands.add_parser("data", help="make, fetch, describe and check data files")
+    """Add ``data make | fetch | info | check | export`` to the subparsers ``commands``; set the handlers as ``run``."""
+    data = commands.add_parser("data", help="make, fetch, describe, check and export data files")
     actions = data.add_subparsers(metavar="ACTION", required=True)
 
     make = actions.add_parser("make", help="collect a set, by OGBench's recipes or a mixture of good and bad behaviour")
@@ -82,6 +82,12 @@ def add_parser(commands: Any) -> None:
     )
     check.add_argument("--map", metavar="FILE", help="also draw the positions in the data, as .png")
     check.set_defaults(run=_check)
+
+    export = actions.add_parser("export", help="write a data file as a Minari set, labelled for a task (extra: minari)")
+    export.add_argument("file", metavar="FILE", help=what)
+    export.add_argument("--env", metavar="TASK", required=True, help="the task, whose rewards it gets")
+    export.add_argument("--out", metavar="DIR", required=True, help="the set's folder, named such as antmaze-medium-v0")
+    export.set_defaults(run=_export)
 
 
 def _make(args: argparse.Namespace) -> int:
@@ -184,6 +190,19 @@ def _check(args: argparse.Namespace) -> int:
     reached = sum(1 for first, stop in episodes if (dataset.masks[first:stop] == 0).any())
     print(f"{args.file} fits {env.spec.full_name}: {dataset.size:,} transitions, {len(episodes):,} episodes")
     print(f"{reached:,} episodes reach the goal; {np.mean(dataset.masks == 0):.2%} of the rows are at it")
+    if (parts := env.parts(dataset)) is not None:
+        counts = {name: sum(1 for first, stop in episodes if done[first:stop].any()) for name, done in parts.items()}
+        print(f"episodes with each part: {', '.join(f'{name} {count:,}' for name, count in counts.items())}")
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    from qdos_brax.data.minari_export import export_minari  # here, since importing gymnasium takes a while
+
+    env = _env(args.env, "mujoco")
+    dataset = formats.read(download.resolve(args.file).path, env)
+    export_minari(dataset, Path(args.out).expanduser(), env.spec.full_name)
+    print(args.out)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The commands of ``python -m qdos_brax``: train, data, evaluate, report, picture, tasks, doctor."""
+"""The commands of ``python -m qdos_brax``: train, data, evaluate, export, report, picture, tasks, doctor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qdos_brax import __version__
-from qdos_brax.commands.arguments import Parser, guarded, parse, positive
+from qdos_brax.commands.arguments import Parser, guarded, natural, parse, positive
 from qdos_brax.commands.config import add_parser as add_config
 from qdos_brax.commands.streams import lasting_streams
 from qdos_brax.commands.train import train_main
@@ -41,15 +41,21 @@ def main_parser(argv: Sequence[str]) -> Parser:
 
         add_parser(commands)
     else:
-        commands.add_parser("data", help="make, fetch, describe and check data files")
+        commands.add_parser("data", help="make, fetch, describe, check and export data files")
 
     evaluate = commands.add_parser("evaluate", help="evaluate the policy of a run")
-    evaluate.add_argument("runs", metavar="RUN", nargs="+", help="a run folder")
+    evaluate.add_argument("runs", metavar="RUN", nargs="+", help="a run folder, or a file that `export` wrote")
     evaluate.add_argument("--episodes", metavar="N", type=positive, default=20, help="episodes per member (default 20)")
     evaluate.add_argument(
         "--video", metavar="FILE", help="also film the first member's first episode, as .mp4; takes one RUN"
     )
     evaluate.set_defaults(run=_evaluate)
+
+    export = commands.add_parser("export", help="write skills and policy of a run to one file, to hand on")
+    export.add_argument("run_folder", metavar="RUN", help="the folder of a finished run")
+    export.add_argument("--out", metavar="FILE", required=True, help="the file to write, as .safetensors")
+    export.add_argument("--member", metavar="N", type=natural, help="one member, from 0 (default: all)")
+    export.set_defaults(run=_export)
 
     report = commands.add_parser("report", help="tables, learning curves and a page of runs")
     report.add_argument("runs", metavar="RUN", nargs="+", help="the folder of a finished run or comparison")
@@ -64,7 +70,11 @@ def main_parser(argv: Sequence[str]) -> Parser:
     report.set_defaults(run=_report)
 
     picture = commands.add_parser("picture", help="draw a task at its start, or an episode and the latents of a run")
-    picture.add_argument("subject", metavar="TASK|RUN", help="a task (python -m qdos_brax tasks), or a finished run")
+    picture.add_argument(
+        "subject",
+        metavar="TASK|RUN",
+        help="a task (python -m qdos_brax tasks), or the folder of a finished run; ./NAME if it is called like a task",
+    )
     picture.add_argument("--out", metavar="FILE", required=True, help="the picture to write, as .png")
     picture.set_defaults(run=_picture)
 
@@ -97,6 +107,15 @@ def _evaluate(args: argparse.Namespace) -> int:
     return 0
 
 
+def _export(args: argparse.Namespace) -> int:
+    from qdos_brax.runs.export import export_run
+
+    for member in export_run(Path(args.run_folder), Path(args.out), args.member):
+        print(", ".join(f"{name} {value}" for name, value in member.items()))
+    print(args.out)
+    return 0
+
+
 def _report(args: argparse.Namespace) -> int:
     from qdos_brax.report.write import write_report
 
@@ -110,7 +129,8 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _picture(args: argparse.Namespace) -> int:
-    if Path(args.subject).is_dir():
+    folder, task = Path(args.subject).is_dir(), _is_task(args.subject)
+    if folder and not task:
         from qdos_brax.analysis.strip import draw_run
 
         draw_run(Path(args.subject), Path(args.out))
@@ -119,7 +139,19 @@ def _picture(args: argparse.Namespace) -> int:
 
         draw_task(args.subject, Path(args.out))
     print(args.out)
+    if folder and task:
+        print(f"note: drew the task; for the folder of that name write ./{args.subject}", file=sys.stderr)
     return 0
+
+
+def _is_task(name: str) -> bool:
+    import envs
+
+    try:
+        envs.get_spec(name)
+    except ValueError:
+        return False
+    return True
 
 
 def _tasks(args: argparse.Namespace) -> int:
@@ -138,7 +170,8 @@ def _tasks(args: argparse.Namespace) -> int:
             for (full, task), short in aliases.items()
             if full == name
         ]
-        variants = [f"task1 to task{count}", f"task{default.task_id}", *(alias or [""])]
+        numbers = "task1" if count == 1 else f"task1 to task{count}"
+        variants = [numbers, f"task{default.task_id}", *(alias or [""])]
         rows.append([name, *sizes, ", ".join(family.engines), *variants])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from qdos_brax import __version__
@@ -64,9 +66,9 @@ def _add_run(group: Any) -> None:
     group.add_argument(
         "--dataset",
         metavar="FILE",
-        help="OGBench .npz, D4RL .hdf5, a Minari folder, or a public set's name: antmaze-large-navigate-v0 (default: "
-        "the task's own set, collected once)",
+        help="OGBench .npz, D4RL .hdf5, Minari folder, or a public set's name (default: the task's own set, collected)",
     )
+    group.add_argument("--skills", metavar="FILE", help="begin on the skills that `export` wrote")
     group.add_argument("--physics", metavar="ENGINE", help="auto, mjx, mjx-warp or mujoco (default auto)")
 
 
@@ -135,6 +137,8 @@ def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:
         "run.wandb": args.wandb,
     }
     flags = {key: value for key, value in by_key.items() if value is not None}
+    if args.skills is not None:
+        flags = _of_skills(args.skills) | flags
     methods = [Config.method] if args.method is None else [name.strip() for name in args.method.split(",")]
     for name in methods:
         if methods.count(name) > 1:
@@ -144,6 +148,13 @@ def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:
         for sizes, config in load_programs(args.env, args.preset, {**flags, "method": method}, args.set).items():
             found["_".join(part for part in (method if len(methods) > 1 else "", sizes) if part) or method] = config
     return found
+
+
+def _of_skills(file: str) -> dict[str, Any]:
+    """Return what a file of skills says of them, by dotted key: what is trained on them must not differ."""
+    from qdos_brax.runs.export import skill_settings  # here, so that --help and a wrong flag wait for no jax
+
+    return {"skills_file": os.path.abspath(file), **skill_settings(Path(file))}
 
 
 def _train(args: argparse.Namespace, started: float) -> int:

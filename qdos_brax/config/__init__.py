@@ -19,6 +19,7 @@ from qdos_brax.config.load import (
     check_method,
     config_hash,
     from_layers,
+    from_plain,
     from_yaml,
     load_config,
     load_programs,
@@ -30,7 +31,7 @@ from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsCo
 from qdos_brax.config.rules import nearest
 from qdos_brax.config.run_groups import RunConfig, ScanConfig
 from qdos_brax.config.scan import hyper_tree, members, population_hyper, values_by_key
-from qdos_brax.config.schema import Config
+from qdos_brax.config.schema import Config, plain
 from qdos_brax.config.skill_groups import DataConfig, SkillsConfig, ValuesConfig
 
 __all__ = [
@@ -54,12 +55,14 @@ __all__ = [
     "families",
     "family_layers",
     "from_layers",
+    "from_plain",
     "from_yaml",
     "hyper_tree",
     "load_config",
     "load_programs",
     "members",
     "nearest",
+    "plain",
     "population_hyper",
     "presets",
     "programs_of",

@@ -92,6 +92,15 @@ def from_yaml(path: str | Path) -> Config:
     return _build(read_values(Path(path)))
 
 
+def from_plain(values: Mapping[str, Any], where: str) -> Config:
+    """Return the configuration of nested values, as ``plain`` makes them; what is absent has its default.
+
+    Raises:
+        UserError: a key is unknown or a value wrong; the line about a key begins with ``where``.
+    """
+    return _build(known_keys(flat(values), where))
+
+
 def to_yaml(config: Config) -> str:
     """Return the whole configuration as YAML text, in the order of the fields."""
     return yaml.safe_dump(plain(config), sort_keys=False, default_flow_style=None, width=110)
@@ -127,7 +136,12 @@ def check_method(config: Config) -> None:
         raise UserError(f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({horizon})")
 
 
-_AS_BEFORE = {("skills", "view"): "world", ("high_level", "actor_updates"): 1}
+_AS_BEFORE = {
+    ("skills", "view"): "world",
+    ("high_level", "actor_updates"): 1,
+    ("labels", "latent"): "sample",
+    ("labels", "inputs"): "normalised",
+}
 
 
 def config_hash(config: Config) -> str:
@@ -138,7 +152,7 @@ def config_hash(config: Config) -> str:
     the members per program if there is one member or no number was given.
     """
     content = plain(config)
-    for key in ("out", "dataset", "run"):
+    for key in ("out", "dataset", "skills_file", "run"):
         del content[key]
     if config.scan == Config().scan:
         del content["scan"]

@@ -20,6 +20,19 @@ class LabelsConfig:
         "min",
         "pred",
     )
+    latent: str = choice(
+        "sample",
+        "skill that a segment is said to have played: a sample of the posterior, or its mean (SUPE's code)",
+        "sample",
+        "mean",
+    )
+    inputs: str = choice(
+        "normalised",
+        "what bonus and reward model see of an observation: normalised, or raw (as the task gives it; SUPE's and "
+        "ExPLORe's code)",
+        "normalised",
+        "raw",
+    )
     rnd_coefficient: Scannable = number(8.0, "weight of the random-network-distillation bonus; 0 turns it off")
     bonus_rows: str = choice("all", "rows that get the bonus", "all", "online")
     rnd_hidden: tuple[int, ...] = widths((256, 256, 256), "hidden layers of the bonus's two networks")

@@ -36,6 +36,9 @@ class Config:
     dataset: str | None = field(
         None, "data file or name of a public data set; none collects the task's default set", Rule("path")
     )
+    skills_file: str | None = field(
+        None, "file of skills to begin on, as `python -m qdos_brax export` writes it; none learns them", Rule("path")
+    )
     out: str | None = field(None, "run folder; none names one under run.root", Rule("path"))
     data: DataConfig = DataConfig()
     values: ValuesConfig = ValuesConfig()
@@ -74,6 +77,12 @@ def labelled() -> dict[str, str]:
 def pretrain_keys() -> list[str]:
     """Return the dotted keys that ``--pretrain-steps`` sets."""
     return [key for key, leaf in leaves(Config) if leaf.metadata["pretrain"]]
+
+
+def skill_keys(low_level: str) -> list[str]:
+    """Return the dotted keys that say what skills are, for a kind of low-level policy (``methods.Method``)."""
+    groups = ("skills", *{"direction": ("hilbert",), "transition": ("diveoff",)}.get(low_level, ()))
+    return [key for key, _ in leaves(Config) if key.partition(".")[0] in groups]
 
 
 def get_field(key: str) -> dataclasses.Field[Any]:

@@ -134,6 +134,9 @@ def _sizes(rows: Rows, env: Task) -> list[str]:
     obs, act = env.observation_size, env.action_size
     widths = {"observations": obs, "next_observations": obs, "actions": act}
     widths |= {"qpos": env.engine.nq, "qvel": env.engine.nv, "extra": env.extra_size}
+    numbers = rows.observations.shape[-1]
+    if numbers in env.unfit:
+        return [f"observations have {numbers} numbers, {env.spec.name} has {obs}: {env.unfit[numbers]}"]
     lines = []
     for key, width in widths.items():
         array = getattr(rows, key)
@@ -173,9 +176,9 @@ def _compare_rewards(rows: Rows, dataset: Dataset, env: Task, attributes: Mappin
         if (dataset.rewards == dataset.rewards[0]).all():
             found.notes.append(f"every reward is {dataset.rewards[0]:g}: no reward to learn from")
         return
-    at_goal = dataset.masks == 0
-    if at_goal.all() or not at_goal.any():
-        found.notes.append(f"{'every' if at_goal.all() else 'no'} row is at the task's goal: no reward to learn from")
+    if (dataset.rewards == dataset.rewards[0]).all():
+        at_goal = "every row is at the task's goal" if dataset.masks[0] == 0 else "no row is at the task's goal"
+        found.notes.append(f"{at_goal}: no reward to learn from")
     if rows.rewards is None:
         return
     differ = env.file_rewards(rows.rewards) != dataset.rewards

@@ -26,6 +26,10 @@ class Normaliser(struct.PyTreeNode):
         """Return ``observation[..., obs]`` normalised."""
         return (observation - self.mean) / self.scale
 
+    def restored(self, observation: jax.Array) -> jax.Array:
+        """Return normalised ``observation[..., obs]`` in the task's own units."""
+        return observation * self.scale + self.mean
+
     def repeated(self, members: int) -> dict[str, jax.Array]:
         """Return its fields, with a leading axis of ``members`` copies."""
         fields = {"mean": self.mean, "scale": self.scale}
@@ -60,11 +64,16 @@ class DeviceData(struct.PyTreeNode):
     extra: jax.Array | None = None
 
 
-def to_device(dataset: Dataset, horizon: int) -> tuple[DeviceData, Normaliser]:
-    """Put ``dataset`` on the default device, normalised by its own statistics."""
+def fit_normaliser(dataset: Dataset) -> Normaliser:
+    """Return the normaliser of a data set's own statistics."""
     mean = dataset.observations.mean(axis=0, dtype=np.float64).astype(np.float32)
     scale = np.maximum(dataset.observations.std(axis=0, dtype=np.float64), 1e-3).astype(np.float32)
-    normaliser = Normaliser(jnp.asarray(mean), jnp.asarray(scale))
+    return Normaliser(jnp.asarray(mean), jnp.asarray(scale))
+
+
+def to_device(dataset: Dataset, horizon: int, normaliser: Normaliser | None = None) -> tuple[DeviceData, Normaliser]:
+    """Put ``dataset`` on the default device, normalised by ``normaliser`` (None: by its own statistics)."""
+    normaliser = normaliser or fit_normaliser(dataset)
     data = DeviceData(
         observations=normaliser(jnp.asarray(dataset.observations)),
         next_observations=normaliser(jnp.asarray(dataset.next_observations)),

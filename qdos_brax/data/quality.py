@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import rankdata
 
 from envs.task import Task
 from qdos_brax.data.dataset import Dataset
@@ -25,15 +24,20 @@ def progress(env: Task, dataset: Dataset, starts: np.ndarray, horizon: int) -> n
     """
     if dataset.qpos is None:
         raise ValueError(f"{dataset.source}: progress needs the simulator's qpos")
-    measured = env.distance_left(dataset.qpos, dataset.extra)
-    if measured is None:
-        return None
-    distance = np.asarray(measured, np.float64)
     last = np.asarray(starts) + horizon - 1
-    before = distance[starts]
-    after = distance[np.where(dataset.ends[last], last, np.minimum(last + 1, dataset.size - 1))]
-    cut_off = np.isinf(before) & np.isinf(after)  # no way before, no way after: nothing gained or lost
-    return np.where(cut_off, 0.0, before - np.where(cut_off, 0.0, after))
+    after = np.where(dataset.ends[last], last, np.minimum(last + 1, dataset.size - 1))
+    before_left, after_left = (_left(env, dataset, rows) for rows in (np.asarray(starts), after))
+    if before_left is None or after_left is None:
+        return None
+    cut_off = np.isinf(before_left) & np.isinf(after_left)  # no way before, no way after: nothing gained or lost
+    return np.where(cut_off, 0.0, before_left - np.where(cut_off, 0.0, after_left))
+
+
+def _left(env: Task, dataset: Dataset, rows: np.ndarray) -> np.ndarray | None:
+    """Return float64[S], the distance left at ``rows`` of the data: of these alone, since a path takes its time."""
+    assert dataset.qpos is not None
+    left = env.distance_left(dataset.qpos[rows], None if dataset.extra is None else dataset.extra[rows])
+    return None if left is None else np.asarray(left, np.float64)
 
 
 def auc(scores: np.ndarray, positive: np.ndarray) -> float:
@@ -43,6 +47,8 @@ def auc(scores: np.ndarray, positive: np.ndarray) -> float:
         scores: float[S].
         positive: bool[S].
     """
+    from scipy.stats import rankdata  # here, for training reads this module and loading this one takes long
+
     scores, positive = np.asarray(scores, np.float64), np.asarray(positive, bool)
     num_positive = int(positive.sum())
     num_negative = len(positive) - num_positive

@@ -14,13 +14,19 @@ from qdos_brax.high_level.macro_step import macro_step
 
 
 class Episodes(NamedTuple):
-    """Hold one entry per episode: success[N] (0 or 1), undiscounted episode_return[N], length[N] in environment
-    steps.
+    """Hold one entry per episode.
+
+    Attributes:
+        success: float[N], 0 or 1.
+        episode_return: float[N], undiscounted.
+        length: int[N], environment steps.
+        score: float[N], the share of the task that was done by the end; None for tasks that are done or not.
     """
 
     success: jax.Array
     episode_return: jax.Array
     length: jax.Array
+    score: jax.Array | None = None
 
 
 def evaluate(
@@ -60,13 +66,16 @@ def evaluate(
 
     start = jax.vmap(env.reset)(jax.random.split(key, episodes))
     zeros = jnp.zeros(episodes)
-    return jax.lax.while_loop(going, body, (start, Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32))))[1]
+    first = Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32))
+    state, totals = jax.lax.while_loop(going, body, (start, first))
+    return totals._replace(score=state.metrics.get("score"))  # a state stays as it was when its episode was over
 
 
 def summary(episodes: Episodes) -> dict[str, np.ndarray]:
     """Return columns of metrics.csv, [members] each, of episodes[members, N]."""
     success = np.asarray(episodes.success)
-    return {
+    score = {} if episodes.score is None else {"eval/score": np.asarray(episodes.score).mean(axis=-1)}
+    return score | {
         "eval/success": success.mean(axis=-1),
         "eval/return": np.asarray(episodes.episode_return).mean(axis=-1),
         "eval/length": np.asarray(episodes.length).mean(axis=-1),

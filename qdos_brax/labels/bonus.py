@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -53,10 +54,11 @@ class RNDBonus:
 
     Args:
         rnd: its networks.
+        see: what they are shown of normalised observations[..., obs].
     """
 
-    def __init__(self, rnd: RND) -> None:
-        self._rnd = rnd
+    def __init__(self, rnd: RND, see: Callable[[jax.Array], jax.Array]) -> None:
+        self._rnd, self._see = rnd, see
 
     def init(self, key: jax.Array) -> RNDState:
         """Return fresh networks."""
@@ -71,10 +73,10 @@ class RNDBonus:
         active: jax.Array,
     ) -> RNDState:
         """Make one step of the predictor."""
-        new = self._rnd.update(state, observation, action, hyper["labels.rnd_learning_rate"])
+        new = self._rnd.update(state, self._see(observation), action, hyper["labels.rnd_learning_rate"])
         return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, state)
 
     def of(self, state: RNDState, observation: jax.Array, action: jax.Array, hyper: dict[str, jax.Array]) -> jax.Array:
         """Return the coefficient times the predictor's error, [B]."""
-        error = self._rnd.error(state.predictor, state.target, observation, action)
+        error = self._rnd.error(state.predictor, state.target, self._see(observation), action)
         return hyper["labels.rnd_coefficient"] * error

@@ -34,16 +34,20 @@ class LabelPhaseState(struct.PyTreeNode):
 
 
 class LabelPhase(MemberPhase):
-    """Infer z ~ q(z | tau) for every segment, and the action u that plays it from the segment's first state.
+    """Infer z from q(z | tau) for every segment, and the action u that plays it from the segment's first state.
 
     Args:
         horizon: steps of a segment.
         total: S, segments of the data.
         low_level: the frozen low-level policy.
+        latent: "sample" of the posterior, or its "mean".
         chunk_size: segments per chunk.
     """
 
-    def __init__(self, horizon: int, total: int, low_level: LowLevelPolicy, chunk_size: int = 16_384) -> None:
+    def __init__(
+        self, horizon: int, total: int, low_level: LowLevelPolicy, latent: str = "sample", chunk_size: int = 16_384
+    ) -> None:
+        self._sampled = latent == "sample"
         self._horizon, self._total, self._low_level = horizon, total, low_level
         self._size = min(chunk_size, total)
         super().__init__("label", "label", -(-total // self._size))
@@ -82,7 +86,7 @@ class LabelPhase(MemberPhase):
             return mean[0], log_std[0]
 
         mean, log_std = jax.lax.map(encode, starts, batch_size=min(1024, self._size))
-        latent = gaussian_sample(sample_key, mean, log_std)
+        latent = gaussian_sample(sample_key, mean, log_std) if self._sampled else mean
         action = self._low_level.to_action(skills, latent, data.observations[starts], hyper["skills.latent_box"])
         labels = jax.lax.dynamic_update_slice(state.action, action, (first, 0))
         return state.replace(key=key, action=labels, update=first + self._size), {}

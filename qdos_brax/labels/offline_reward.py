@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -48,10 +49,11 @@ class PredictedReward:
 
     Args:
         model: the reward model.
+        see: what it is shown of normalised observations[..., obs].
     """
 
-    def __init__(self, model: RewardModel) -> None:
-        self._model = model
+    def __init__(self, model: RewardModel, see: Callable[[jax.Array], jax.Array]) -> None:
+        self._model, self._see = model, see
 
     def init(self, key: jax.Array) -> RewardModelState:
         """Return a fresh model."""
@@ -61,12 +63,12 @@ class PredictedReward:
         self, state: RewardModelState, rows: Transition, learning_rate: Any, active: jax.Array
     ) -> RewardModelState:
         """Make one step of both heads."""
-        new = self._model.update(state, rows.observation, rows.action, rows.reward, rows.mask, learning_rate)
+        new = self._model.update(state, self._see(rows.observation), rows.action, rows.reward, rows.mask, learning_rate)
         return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, state)
 
     def label(self, state: RewardModelState, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:
         """Return the predicted reward, and the probability of going on as mask."""
-        reward, logit = self._model.predict(state.params, rows.observation, rows.action)
+        reward, logit = self._model.predict(state.params, self._see(rows.observation), rows.action)
         return reward, jax.nn.sigmoid(logit)
 
 
@@ -75,12 +77,13 @@ class MinimumReward(PredictedReward):
 
     Args:
         model: the reward model.
+        see: what it is shown of normalised observations[..., obs].
         horizon: environment steps of a macro step.
         lowest: the lowest reward of an environment step.
     """
 
-    def __init__(self, model: RewardModel, horizon: int, lowest: float) -> None:
-        super().__init__(model)
+    def __init__(self, model: RewardModel, see: Callable[[jax.Array], jax.Array], horizon: int, lowest: float) -> None:
+        super().__init__(model, see)
         self._horizon, self._lowest = horizon, lowest
 
     def label(self, state: RewardModelState, rows: Transition, discount: Any) -> tuple[jax.Array, jax.Array]:

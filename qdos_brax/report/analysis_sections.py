@@ -2,46 +2,26 @@
 
 from __future__ import annotations
 
-import base64
 import colorsys
-import io
 from typing import Any
 
-import matplotlib.image
 import numpy as np
 
-from qdos_brax.report.elements import (
-    PALETTE,
-    Figure,
-    Image,
-    Section,
-    Trace,
-    axis_layout,
-    json_numbers,
-    log_axis,
-    member_id,
-)
-from qdos_brax.report.member_analysis import (
-    WALL_COLOUR,
-    MemberAnalysis,
-    maze_extent,
-    quality_colours,
-    quality_groups,
-    quality_names,
-)
+from qdos_brax.report.elements import PALETTE, Figure, Section, axis_layout, json_numbers, log_axis
+from qdos_brax.report.episode_section import episode_section
+from qdos_brax.report.maps import MAP_HEIGHT, dots, goal_star, map_layout, path_line
+from qdos_brax.report.member_analysis import MemberAnalysis, quality_colours, quality_groups, quality_names
 
 PROGRESS = "progress (decrease of the distance to the goal)"
-DISTANCE = "distance left to the goal"
 SKILL_SETS = (("grid", "a grid of skills"), ("between", "from one skill to another"))
 _COLOUR_BY = ("quality", "progress", "return", "weight")
 _PLAIN_MARKER = {"size": 6, "opacity": 0.6, "color": "#9aa1aa", "showscale": False}  # of what is not known
 _COLOUR_BAR = {"thickness": 10, "outlinewidth": 0}
-_SQUARE = 430  # pixels, the height of a map
 
 
 def analysis_sections(analyses: list[MemberAnalysis]) -> list[Section]:
     """Return the sections that have something to show; arrays that a task or a method cannot give leave theirs out."""
-    made = (_weights(analyses), _latents(analyses), _skill_paths(analyses), _episodes(analyses))
+    made = (_weights(analyses), _latents(analyses), _skill_paths(analyses), episode_section(analyses))
     return [section for section in made if section.figures or section.subsections]
 
 
@@ -77,7 +57,7 @@ def _weights(analyses: list[MemberAnalysis]) -> Section:
 def _weight_chart(analysis: MemberAnalysis) -> Figure:
     weight, gain = analysis.own["weight"], analysis.data["gain"]
     groups = quality_groups(analysis, len(gain))
-    data = [_dots(gain[chosen], weight[chosen], colour, name, analysis) for chosen, colour, name in groups]
+    data = [dots(gain[chosen], weight[chosen], colour, name, analysis) for chosen, colour, name in groups]
     layout = axis_layout(PROGRESS, "weight")
     layout["yaxis"] |= log_axis(weight)
     return Figure(analysis.label, data, layout)
@@ -97,14 +77,14 @@ def _latents(analyses: list[MemberAnalysis]) -> Section:
 
 def _latent_chart(analysis: MemberAnalysis, markers: dict[str, dict[str, Any]], known: list[str]) -> Figure:
     x, y = analysis.own["tsne"].T
-    trace = _dots(x, y, PALETTE[0], "segment", analysis) | {"marker": next(iter(markers.values()), _PLAIN_MARKER)}
+    trace = dots(x, y, PALETTE[0], "segment", analysis) | {"marker": next(iter(markers.values()), _PLAIN_MARKER)}
     if facts := _facts(analysis):
         trace |= {"customdata": facts, "hovertemplate": "%{customdata}<extra></extra>"}
     layout = axis_layout("", "") | {"margin": {"l": 14, "r": 10, "t": 14, "b": 14}}
     for axis in ("xaxis", "yaxis"):
         layout[axis] |= {"showticklabels": False, "zeroline": False}
     choices = {name: {"marker": markers.get(name, _PLAIN_MARKER)} for name in known}
-    return Figure(analysis.label, [trace], layout, choices, _SQUARE)
+    return Figure(analysis.label, [trace], layout, choices, MAP_HEIGHT)
 
 
 def _markers(analysis: MemberAnalysis) -> dict[str, dict[str, Any]]:
@@ -160,121 +140,8 @@ def _skill_paths(analyses: list[MemberAnalysis]) -> Section:
 def _skill_map(analysis: MemberAnalysis, name: str, words: str) -> Figure:
     paths = analysis.own[name]
     colours = skill_colours(name, len(paths))
-    data = [_path(path, colours[i], f"skill {i + 1} of {len(paths)}", analysis) for i, path in enumerate(paths)]
-    return Figure(f"{words}: {analysis.label}", [*data, *_goal(analysis)], _map_layout(analysis), height=_SQUARE)
-
-
-def _episodes(analyses: list[MemberAnalysis]) -> Section:
-    found = [(analysis, _episode_charts(analysis), _images(analysis)) for analysis in analyses]
-    shown = [(analysis.label, charts, images) for analysis, charts, images in found if charts or images]
-    text = (
-        "The first evaluation episode of each member: the latent of each decision, the distance left to the goal, the "
-        "path, and the scene at the marked steps, as far as the task has them."
-    )
-    parts = [
-        Section(label, figures=charts, images=images, expanded=i == 0)
-        for i, (label, charts, images) in enumerate(shown)
-    ]
-    return Section("Skills over an episode", text, subsections=parts)
-
-
-def _episode_charts(analysis: MemberAnalysis) -> list[Figure]:
-    figures = []
-    if "latents" in analysis.own:
-        figures.append(_skills_over_time(analysis))
-    if "left" in analysis.own:
-        figures.append(_distance_over_time(analysis))
-    if "path" in analysis.own:
-        data = [_path(analysis.own["path"], PALETTE[0], "path", analysis), *_goal(analysis)]
-        figures.append(Figure("path", data, _map_layout(analysis), height=_SQUARE))
-    return figures
-
-
-def _skills_over_time(analysis: MemberAnalysis) -> Figure:
-    """Return the latents of an episode, dimension by dimension, at the steps at which they were chosen."""
-    latents = analysis.own["latents"]
-    period = int(analysis.member.values["skills.horizon"])
-    largest = float(np.abs(latents).max())
-    heat = {
-        "type": "heatmap",
-        "x": [period * i for i in range(len(latents))],
-        "z": [json_numbers(column) for column in latents.T],
-        "colorscale": "RdBu",
-        "zmin": -largest,
-        "zmax": largest,
-        "colorbar": _COLOUR_BAR | {"title": {"text": "z"}},
-        "name": "z",
-        "hovertemplate": "step %{x}, dimension %{y}: %{z:.2f}<extra></extra>",
-        "meta": {"member": member_id(analysis.member)},
-    }
-    layout = axis_layout("environment steps", "dimension of the latent")
-    return Figure("skills over time", [heat], layout)
-
-
-def _distance_over_time(analysis: MemberAnalysis) -> Figure:
-    left = analysis.own["left"]
-    data = [_path(np.stack([np.arange(len(left)), left], axis=1), PALETTE[0], DISTANCE, analysis)]
-    if steps := [step for step, _ in _frames(analysis)]:
-        data.append(_dots(np.asarray(steps), left[steps], PALETTE[1], "picture", analysis) | {"showlegend": False})
-    layout = axis_layout("environment steps", "distance")
-    layout["yaxis"] |= {"rangemode": "tozero"}
-    return Figure(DISTANCE, data, layout)
-
-
-def _images(analysis: MemberAnalysis) -> list[Image]:
-    return [Image(f"step {step}", _jpeg(frame)) for step, frame in _frames(analysis)]
-
-
-def _frames(analysis: MemberAnalysis) -> list[tuple[int, np.ndarray]]:
-    """Return (step, uint8[height, width, 3]) of each picture of the episode."""
-    if not {"frames", "frame_steps"} <= set(analysis.own):
-        return []
-    return list(zip(map(int, analysis.own["frame_steps"]), analysis.own["frames"], strict=True))
-
-
-# --- Traces ----------------------------------------------------------------------------------------------------
-
-
-def _dots(x: np.ndarray, y: np.ndarray, colour: str, name: str, analysis: MemberAnalysis) -> Trace:
-    marker = {"color": colour, "size": 6, "opacity": 0.65}
-    meta = {"member": member_id(analysis.member)}
-    return {"x": json_numbers(x), "y": json_numbers(y), "mode": "markers", "marker": marker, "name": name, "meta": meta}
-
-
-def _path(path: np.ndarray, colour: str, name: str, analysis: MemberAnalysis) -> Trace:
-    """Return a line with a dot at its end."""
-    x, y = path.T
-    sizes = [0] * (len(path) - 1) + [6]
-    drawn = {"mode": "lines+markers", "line": {"color": colour, "width": 2}, "showlegend": False}
-    return _dots(x, y, colour, name, analysis) | drawn | {"marker": {"color": colour, "size": sizes, "opacity": 1}}
-
-
-def _goal(analysis: MemberAnalysis) -> list[Trace]:
-    """Return a star at the goal; nothing for a task whose goal is no place."""
-    if "goal" not in analysis.data:
-        return []
-    x, y = analysis.data["goal"]
-    marker = {"symbol": "star", "size": 15, "color": "#d00000"}
-    own = {"mode": "markers", "marker": marker, "name": "goal", "showlegend": False}
-    return [{"x": [float(x)], "y": [float(y)], **own}]
-
-
-def _map_layout(analysis: MemberAnalysis) -> dict[str, Any]:
-    """Return the layout of a map: one unit is as long in x as in y, walls are grey boxes."""
-    layout = axis_layout("", "") | {"margin": {"l": 30, "r": 10, "t": 10, "b": 26}}
-    layout["xaxis"] |= {"constrain": "domain", "showgrid": False, "zeroline": False}
-    layout["yaxis"] |= {"constrain": "domain", "showgrid": False, "zeroline": False, "scaleanchor": "x"}
-    if (extent := maze_extent(analysis)) is not None:
-        (left, low), (right, high), half = extent
-        layout["shapes"] = [_wall(x, y, half) for x, y in analysis.data["walls"]]
-        layout["xaxis"]["range"] = [float(left), float(right)]
-        layout["yaxis"]["range"] = [float(low), float(high)]
-    return layout
-
-
-def _wall(x: float, y: float, half: float) -> dict[str, Any]:
-    box = {"x0": float(x) - half, "x1": float(x) + half, "y0": float(y) - half, "y1": float(y) + half}
-    return {"type": "rect", **box, "fillcolor": WALL_COLOUR, "line": {"width": 0}, "layer": "below"}
+    data = [path_line(path, colours[i], f"skill {i + 1} of {len(paths)}", analysis) for i, path in enumerate(paths)]
+    return Figure(f"{words}: {analysis.label}", [*data, *goal_star(analysis)], map_layout(analysis), height=MAP_HEIGHT)
 
 
 def _by_direction(x: float, y: float) -> str:
@@ -285,10 +152,3 @@ def _by_direction(x: float, y: float) -> str:
 
 def _hex(colour: np.ndarray) -> str:
     return "#" + "".join(f"{round(float(part)):02x}" for part in colour)
-
-
-def _jpeg(frame: np.ndarray) -> str:
-    """Return a picture as a data URI."""
-    content = io.BytesIO()
-    matplotlib.image.imsave(content, frame, format="jpeg")
-    return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()

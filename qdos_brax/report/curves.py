@@ -19,11 +19,11 @@ from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
 from qdos_brax.report.study import Study, format_value, short_key
 
 TICKS = 8  # the most values of a scan that all get a label on its axis
-MEASURES = (("eval/success", "success"), ("eval/return", "return"))
+MEASURES = (("eval/success", "success"), ("eval/score", "score"), ("eval/return", "return"))
 
 
 def draw_curves(study: Study, out: Path) -> None:
-    """Draw success and return over the environment steps, a row of panels per task.
+    """Draw success, return and, where a task has one, the score over the environment steps, a row of panels per task.
 
     A thick line is the mean of a setting's members, the band its 95 % bootstrap interval, a thin line a member. A
     dashed horizontal line is a method that only learned offline.
@@ -36,10 +36,14 @@ def draw_curves(study: Study, out: Path) -> None:
         UserError: the file cannot be written.
     """
     tasks = len(study.tasks)
-    figure, axes = plt.subplots(tasks, len(MEASURES), figsize=(11, 4 * tasks), layout="constrained", squeeze=False)
+    scored = any(curves(study, task, "eval/score") for task in study.tasks)
+    measures = [(column, name) for column, name in MEASURES if name != "score" or scored]
+    figure, axes = plt.subplots(
+        tasks, len(measures), figsize=(5.5 * len(measures), 4 * tasks), layout="constrained", squeeze=False
+    )
     colours = setting_colours(study)
     for row, task in zip(axes, study.tasks, strict=True):
-        for axis, (column, name) in zip(row, MEASURES, strict=True):
+        for axis, (column, name) in zip(row, measures, strict=True):
             for curve in curves(study, task, column):
                 _draw_curve(axis, curve, colours[curve.setting.label])
             axis.set_xlabel("environment steps")

@@ -7,6 +7,7 @@ member's own trace, "setting" for one that stands for all members of a setting.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ Trace = dict[str, Any]
 # The colours of Okabe and Ito, which colour-blind readers can tell apart. Their yellow and black are left out: lines in
 # them cannot be seen on a white or on a dark page.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A7A7A", "#9A5FB5", "#8C6D31", "#A5AA99")
+_MOST_NAMES = 12  # in the description of a chart
 
 
 class Card(NamedTuple):
@@ -40,12 +42,30 @@ class Image(NamedTuple):
     """Hold a picture.
 
     Attributes:
-        title: what it shows.
+        title: the line below it.
         source: the picture itself, as a data URI.
+        description: what is to be seen, for those who cannot see it.
     """
 
     title: str
     source: str
+    description: str
+
+
+class Film(NamedTuple):
+    """Hold an animated picture, which stands still until the reader starts it.
+
+    Attributes:
+        title: the line below it.
+        source: the animated picture itself, as a data URI.
+        still: the picture that is shown before, likewise.
+        description: what is to be seen, for those who cannot see it.
+    """
+
+    title: str
+    source: str
+    still: str
+    description: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +98,7 @@ class Section:
         figures: its charts.
         choices: names of what the reader can switch in its charts; the first one is shown at first.
         tables: its tables.
+        films: its animated pictures.
         images: its pictures.
         listings: (title, text) of longer texts, folded away.
         subsections: sections within it, each folded away under its title.
@@ -90,18 +111,29 @@ class Section:
     figures: Sequence[Figure] = ()
     choices: Sequence[str] = ()
     tables: Sequence[Table] = ()
+    films: Sequence[Film] = ()
     images: Sequence[Image] = ()
     listings: Sequence[tuple[str, str]] = ()
     subsections: Sequence[Section] = ()
     expanded: bool = False
 
 
+def describe(figure: Figure) -> str:
+    """Return what a chart shows, in words: its title, its axes, and the names in its legend."""
+    x, y = (figure.layout.get(axis, {}).get("title", {}).get("text", "") for axis in ("xaxis", "yaxis"))
+    axes = f"{y} over {x}" if x and y else x or y
+    names = dict.fromkeys(trace["name"] for trace in figure.data if trace.get("name") and trace.get("showlegend", True))
+    parts = (figure.title, axes, ", ".join(list(names)[:_MOST_NAMES]))
+    return "Chart: " + "; ".join(part for part in parts if part)
+
+
 # --- Names -----------------------------------------------------------------------------------------------------
 
 
 def member_id(member: Member) -> str:
-    """Return the name by which the page's filter knows a member."""
-    return f"{member.run}#{member.task}#{member.seed}#{sorted(member.values.items())}"
+    """Return the name by which the page's filter knows a member; short, since every trace bears it."""
+    everything = f"{member.run}#{member.task}#{member.seed}#{sorted(member.values.items())}"
+    return hashlib.sha256(everything.encode()).hexdigest()[:12]
 
 
 def member_name(member: Member) -> str:

@@ -11,12 +11,12 @@ import jinja2
 
 from qdos_brax.files import write_text
 from qdos_brax.report.curves import setting_colours
-from qdos_brax.report.elements import Section, member_id
+from qdos_brax.report.elements import Section, describe, member_id
 from qdos_brax.report.member_analysis import MemberAnalysis
 from qdos_brax.report.sections import sections
 from qdos_brax.report.study import Study
 
-_PASSED_ON = ("title", "text", "cards", "choices", "tables", "images", "listings", "expanded")
+_PASSED_ON = ("title", "text", "cards", "choices", "tables", "films", "images", "listings", "expanded")
 
 
 def write_page(study: Study, analyses: list[MemberAnalysis], out: Path) -> None:
@@ -49,10 +49,11 @@ def _part(section: Section, figures: list[dict[str, Any]]) -> dict[str, Any]:
     """Return a section for the template; its charts are added to ``figures``, and the template knows their index."""
     shown = []
     for figure in section.figures:
-        shown.append({"title": figure.title, "id": len(figures), "height": figure.height})
+        own = {"title": figure.title, "description": describe(figure), "height": figure.height}
+        shown.append(own | {"id": len(figures)})
         figures.append({"data": figure.data, "layout": figure.layout, "choices": figure.choices})
-    own = {name: getattr(section, name) for name in _PASSED_ON}
-    return own | {"figures": shown, "subsections": [_part(part, figures) for part in section.subsections]}
+    passed_on = {name: getattr(section, name) for name in _PASSED_ON}
+    return passed_on | {"figures": shown, "subsections": [_part(part, figures) for part in section.subsections]}
 
 
 def _subtitle(study: Study) -> str:

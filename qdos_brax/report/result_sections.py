@@ -73,13 +73,13 @@ def _mean_and_members(setting: Setting, task: str, colour: str) -> Iterable[Trac
 
 
 def learning_section(study: Study) -> Section:
-    """Return a chart per task and measure: success and return over the environment steps."""
+    """Return a chart per task and measure: success, score and return over the environment steps."""
     colours = setting_colours(study)
     figures = [
         Figure(
             title_with_task(study, name, task),
             [trace for curve in drawn for trace in _curve(curve, colours[curve.setting.label])],
-            axis_layout("environment steps", name, share=name == "success"),
+            axis_layout("environment steps", name, share=name in ("success", "score")),
         )
         for task in study.tasks
         for column, name in MEASURES

@@ -100,8 +100,9 @@ def _line(setting: Setting, member: Member, phase: str, name: str, colour: str) 
     return {
         "x": [float(row["update"] or i) for i, row in enumerate(rows)],
         "y": json_numbers([float(row[name]) for row in rows]),
-        "mode": "lines",
+        "mode": "lines" if len(rows) > 1 else "markers",  # a line of one point cannot be seen
         "line": {"color": colour, "width": 1.5},
+        "marker": {"color": colour, "size": 8},
         "name": f"{setting.label}, {member_name(member)}",
         "showlegend": False,
         "meta": {"member": member_id(member)},

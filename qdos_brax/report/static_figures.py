@@ -15,9 +15,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, Normalize
 
-from qdos_brax.report.analysis_sections import DISTANCE, PROGRESS, SKILL_SETS, skill_colours
+from qdos_brax.report.analysis_sections import PROGRESS, SKILL_SETS, skill_colours
 from qdos_brax.report.curves import save_figure, setting_colours
 from qdos_brax.report.elements import PALETTE
+from qdos_brax.report.episode_section import DISTANCE
 from qdos_brax.report.member_analysis import (
     WALL_COLOUR,
     MemberAnalysis,

@@ -11,6 +11,7 @@ from qdos_brax.files import user_errors, write_text
 from qdos_brax.report.curves import draw_curves, draw_scans
 from qdos_brax.report.member_analysis import read_analyses
 from qdos_brax.report.page import write_page
+from qdos_brax.report.published import published_tables
 from qdos_brax.report.static_figures import draw_static_figures
 from qdos_brax.report.study import read_study
 from qdos_brax.report.tables import Table, first_goal_csv, success_csv, tables
@@ -52,7 +53,7 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) 
     if not out.is_dir():
         raise UserError(f"--out {out} is a file; give a folder for the files of the report")
     page, curves, scan = out / "report.html", out / "curves.png", out / "scan.png"
-    found = tables(study)
+    found = [*tables(study), *published_tables(study.tasks)]
     draw_curves(study, curves)
     files = [page, curves]
     if draw_scans(study, scan):

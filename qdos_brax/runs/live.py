@@ -9,7 +9,7 @@ from rich.table import Table
 
 from qdos_brax.runs.metrics import Row, measured
 
-_SHOWN = {"success": "eval/success", "return": "eval/return", "first goal": "first_goal_step"}
+_SHOWN = {"success": "eval/success", "score": "eval/score", "return": "eval/return", "first goal": "first_goal_step"}
 
 
 class MemberBoard:
@@ -44,11 +44,12 @@ class MemberBoard:
     def __rich__(self) -> Table:
         """Return the current table."""
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for name in (*self._names, *_SHOWN, "loss", ""):
+        shown = {name: column for name, column in _SHOWN.items() if name != "score" or column in self._latest[0]}
+        for name in (*self._names, *shown, "loss", ""):
             table.add_column(name.rpartition(".")[2].replace("_", " "), justify="right", no_wrap=True)
         for member, latest, loss in zip(self._members, self._latest, self._loss, strict=True):
             cells = [f"{member[name]:g}" for name in self._names]
-            cells += [f"{latest[column]:,.4g}" if column in latest else "" for column in _SHOWN.values()]
+            cells += [f"{latest[column]:,.4g}" if column in latest else "" for column in shown.values()]
             frozen = latest.get("status_ok") == 0
             table.add_row(*cells, loss, "frozen" if frozen else "", style="red" if frozen else "")
         return table

@@ -130,6 +130,7 @@ class MetricsTable:
             **{key: _plain(text) for key, text in self._members[index].items() if key != "member"},
             "env_steps": int(latest.get("env_steps", 0)),
             "eval_success": _or_none(latest, "eval/success"),
+            **({"eval_score": latest["eval/score"]} if "eval/score" in latest else {}),
             "eval_return": _or_none(latest, "eval/return"),
             "eval_episodes": _whole_or_none(latest, "eval/episodes"),
             "best_success": max(successes, default=None),

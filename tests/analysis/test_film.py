@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shlex
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import imageio_ffmpeg
 import jax
 import matplotlib.image
 import numpy as np
+import PIL.Image
 import pytest
 
 from envs import render
@@ -17,7 +19,8 @@ from qdos_brax.analysis import film, strip
 from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.commands import main as commands
 from qdos_brax.errors import UserError
-from qdos_brax.report.video import mp4
+from qdos_brax.report import picture
+from qdos_brax.report.video import mp4, webp
 from tests.report.folders import write_run
 
 CAP = 25
@@ -89,6 +92,18 @@ def test_frames_are_what_was_written(tmp_path: Path, height: int, monkeypatch: p
     np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)), [0, 120, 250], atol=4)
 
 
+def test_a_small_film_is_what_was_drawn() -> None:
+    """Frames of one colour each, at ten per second; they play again and again."""
+    levels = (0, 120, 250)
+    content = webp(np.stack([np.full((24, 32, 3), level, np.uint8) for level in levels]), fps=10)
+    with PIL.Image.open(io.BytesIO(content)) as image:
+        assert image.n_frames == 3 and image.size == (32, 24) and image.info["loop"] == 0
+        for i, level in enumerate(levels):
+            image.seek(i)
+            np.testing.assert_allclose(np.asarray(image.convert("RGB")), level, atol=4)
+            assert image.info["duration"] == 100
+
+
 def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     out = tmp_path / "a.mp4"
     out.write_text("earlier")
@@ -145,6 +160,22 @@ def test_picture_of_a_run(finished: Path, tmp_path: Path, monkeypatch: pytest.Mo
         assert main(f"picture {finished} --out {tmp_path}/run.png") == 0
         widths.append(matplotlib.image.imread(tmp_path / "run.png").shape[1])
     assert widths[1] == widths[0] * 5 // 4  # four frames, and the map of latents beside them
+
+
+def test_a_folder_called_like_a_task_is_drawn_by_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn: list[tuple[str, str]] = []
+    monkeypatch.setattr(strip, "draw_run", lambda run, out: drawn.append(("run", str(run))))
+    monkeypatch.setattr(picture, "draw_task", lambda name, out: drawn.append(("task", name)))
+    (tmp_path / "antsoccer").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main("picture antsoccer --out a.png") == 0
+    out, err = capsys.readouterr()
+    assert out == "a.png\n" and err == "note: drew the task; for the folder of that name write ./antsoccer\n"
+    assert main("picture ./antsoccer --out a.png") == 0 and main("picture antmaze --out a.png") == 0
+    assert drawn == [("task", "antsoccer"), ("run", "antsoccer"), ("task", "antmaze")]
+    assert capsys.readouterr().err == ""
 
 
 def test_latents_of_a_run_are_those_of_its_analysis(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import envs
 from envs import render
-from qdos_brax.analysis import conclusion, inside
+from qdos_brax.analysis import conclusion, inside, pictures
 from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.quality import QUALITY
@@ -51,7 +51,8 @@ def data() -> Dataset:
 @pytest.fixture
 def analysed(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An analysed run; its second segment is worth ten times as much as the others."""
-    monkeypatch.setattr(inside, "_FRAME_HEIGHT", 48)
+    monkeypatch.setattr(pictures, "_HEIGHT", 48)
+    monkeypatch.setattr(pictures, "_WIDTH", 64)
     trained = finished_runs.load_run(finished)
     advantage = jnp.zeros((2, 33)).at[:, 1].set(math.log(10))
     trained = trained._replace(artifacts=trained.artifacts | {"advantage": advantage})
@@ -87,7 +88,9 @@ def test_inside_and_its_page(analysed: Path, opengl_or_not: bool) -> None:
     start[:2] = found["0/path"][0]
     assert found["0/left"][0] == pytest.approx(float(env.distance_left(start)), rel=1e-5)
     if opengl_or_not:
-        assert found["0/frames"].shape == (6, 48, 48, 3) and found["0/frame_steps"].tolist() == [0, 5, 10, 15, 20, 25]
+        assert found["0/frames"].shape == (6, 48, 64, 3) and found["0/frame_steps"].tolist() == [0, 5, 10, 15, 20, 25]
+        assert found["0/film_speed"] == pytest.approx(2.5 / (26 / 10))  # 2.5 s of the simulation in 26 frames
+        assert found["0/film"].tobytes()[8:12] == b"WEBP"
 
     written_as_finished(analysed)
     study = read_study([analysed])
@@ -101,7 +104,7 @@ def test_inside_and_its_page(analysed: Path, opengl_or_not: bool) -> None:
     assert len(sections["Where skills lead"].figures[0].data) == 25 + 1
     assert len(sections["Skills over an episode"].subsections[0].images) == (6 if opengl_or_not else 0)
     write_page(study, analyses, analysed / "report.html")
-    assert (analysed / "report.html").read_text().count("data:image/jpeg;base64,") == (6 if opengl_or_not else 0)
+    assert (analysed / "report.html").read_text().count("data:image/jpeg;base64,") == (6 + 1 if opengl_or_not else 0)
 
     (analysed / "inside.npz").write_bytes((analysed / "inside.npz").read_bytes()[:1000])
     assert read_analyses(study)[0] == [] and "delete it" in read_analyses(study)[1][0]

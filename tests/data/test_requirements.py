@@ -17,7 +17,8 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import to_device
 from qdos_brax.data.requirements import unmet
 from qdos_brax.errors import UserError
-from qdos_brax.methods.build import build_context, build_phases, value_phase
+from qdos_brax.methods.build import build_context, build_phases
+from qdos_brax.methods.low_level_kinds import value_phase
 from tests.point import PointEnv, bound, point_config, point_dataset, run_phase
 
 HORIZON = 5

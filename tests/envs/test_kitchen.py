@@ -17,6 +17,9 @@ import envs.gym_api
 from envs import render
 from envs.manipulation.kitchen_rig import START_QPOS, SUBTASKS
 from envs.physics.mujoco.engine import _SENSORS
+from qdos_brax.collection.scripted.kitchen import KitchenDemonstrator
+from qdos_brax.high_level.evaluation import evaluate, summary
+from tests.collection.scripted.kitchen_player import play
 from tests.envs.kitchen_reference import kitchen, reference, rollout
 
 
@@ -102,6 +105,36 @@ def test_subtasks_count_once_and_the_last_one_ends_the_episode_as_in_the_referen
     assert expected["terminated"].tolist() == [False] * (steps - 1) + [True]
 
 
+def scripted_actions(env: Any, plans: list[list[str]], steps: int) -> np.ndarray:
+    """Actions float32[n, steps, 9] of demonstrations, which touch and move things."""
+    demonstrator, plan = KitchenDemonstrator(env, len(plans), 0.05), iter(plans)
+    demonstrator._plan = lambda rng: next(plan)  # type: ignore[method-assign]
+    *played, _ = play(env, demonstrator, np.zeros(len(plans), np.int8), steps)
+    return np.stack([actions for _, actions, _ in played], axis=1)
+
+
+def test_scripted_steps_equal_the_reference_bit_for_bit(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    for actions in scripted_actions(env, [["kettle"], ["light switch"]], 60):
+        expected = assert_the_same(env, actions, monkeypatch)
+        assert expected["reward"].sum() == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kitchen-mixed", "kitchen-partial"])
+def test_two_thousand_scripted_steps_equal_the_reference(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = kitchen(name)
+    others = [subtask for subtask in SUBTASKS if subtask not in env.subtasks]
+    plans = [[*np.roll(env.subtasks, shift), *others] for shift in range(4)]
+    plans += [[*others, *np.roll(env.subtasks, shift)] for shift in range(4)]
+    found = [
+        assert_the_same(env, actions, monkeypatch, seed)
+        for seed, actions in enumerate(scripted_actions(env, plans, 280))
+    ]
+    assert sum(len(episode["reward"]) for episode in found) >= 2000
+    assert any(episode["terminated"][-1] for episode in found)
+    assert sum(episode["reward"].sum() for episode in found) >= 16
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kitchen-mixed", "kitchen-partial"])
 def test_two_thousand_random_steps_equal_the_reference(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +171,22 @@ def test_completed_subtasks_are_state_that_can_be_given_and_decide_reward_and_su
     rows: Any = SimpleNamespace(qpos=None, extra=extra)
     for labelled in (env.labels(rows), env.labels(SimpleNamespace(qpos=None, extra=jnp.asarray(extra)))):
         np.testing.assert_array_equal(labelled, [[-4, -3, 0], [1, 1, 0]])
+    done = {name: value.tolist() for name, value in env.parts(rows).items()}
+    assert done.pop("microwave") == [False, True, True] and set(done) == set(env.subtasks[1:])
+    assert list(done.values()) == [[False, False, True]] * 3
     assert kitchen("kitchen-partial").score(extra).tolist() == [0, 0.25, 1]
+
+
+def test_an_evaluation_tells_the_share_of_the_four(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(envs.Task, "episode_length", 4)  # three are completed in the first step, the kettle never
+    qpos, qvel = almost_done()
+    qvel[24] = 0
+    monkeypatch.setattr(env, "reset", lambda key: env.reset_to(qpos, qvel, key=key))
+    found = evaluate(env, lambda obs: obs[:1], lambda obs, latent: jnp.zeros(9), jax.random.key(0), 2, 2)
+    assert found.score is not None and found.score.tolist() == [0.75, 0.75]
+    members = type(found)(*(part[None] for part in found))
+    assert summary(members)["eval/score"].tolist() == [0.75] and summary(members)["eval/success"].tolist() == [0]
+    assert "eval/score" not in summary(members._replace(score=None))
 
 
 def test_a_broken_state_is_reset_alone(three: Any) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 import envs
 from envs.mazes import locomotion
+from envs.mazes.families import MAZE_FAMILIES
 from envs.physics import resolve_physics
 
 # nq, nv, observation, action (OGBench 1.2.2)
@@ -20,8 +21,11 @@ SIZES = {"antmaze": (15, 14, 29, 8), "antsoccer": (22, 20, 42, 8), "humanoidmaze
 CAPS = {"humanoidmaze-medium": 2000, "humanoidmaze-large": 2000, "humanoidmaze-giant": 4000}  # all others 1000
 
 
-@pytest.mark.parametrize("spec", envs.list_tasks(), ids=lambda spec: spec.full_name)
-def test_every_task_resets_and_steps(spec: envs.TaskSpec) -> None:
+MAZES = [spec for spec in envs.list_tasks() if spec.family in MAZE_FAMILIES]
+
+
+@pytest.mark.parametrize("spec", MAZES, ids=lambda spec: spec.full_name)
+def test_every_maze_resets_and_steps(spec: envs.TaskSpec) -> None:
     env = envs.make(spec.full_name, physics="mujoco")
     nq, nv, obs_size, action_size = SIZES[spec.family]
     assert (env.observation_size, env.action_size) == (obs_size, action_size)
@@ -52,7 +56,7 @@ def test_names() -> None:
     assert envs.get_spec("antsoccer-task2").full_name == "antsoccer-arena-task2"
     assert envs.get_spec("humanoidmaze").full_name == "humanoidmaze-medium-task1"
     assert envs.get_spec("antmaze-teleport").full_name == "antmaze-teleport-task1"
-    assert len(envs.list_tasks()) == 45
+    assert len(MAZES) == 45
     for wrong, near in [
         ("antmaze-larg", "'antmaze-large'"),
         ("antmaze-medium-task7", "'antmaze-medium-task"),
@@ -70,7 +74,7 @@ def test_names() -> None:
 
 def test_listing_loads_no_jax() -> None:
     code = (
-        "import envs, sys; assert len(envs.list_tasks()) == 45; assert not {'jax', 'mujoco', 'brax'} & set(sys.modules)"
+        "import envs, sys; assert len(envs.list_tasks()) > 45; assert not {'jax', 'mujoco', 'brax'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

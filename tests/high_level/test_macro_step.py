@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
-from qdos_brax.high_level.evaluation import evaluate
+from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
 from qdos_brax.high_level.macro_step import macro_step, reset_done
 from qdos_brax.skills.latent_map import Prior, latent_map
 
@@ -95,6 +95,29 @@ def test_evaluation_plays_whole_episodes(goal, success, total, length):
     np.testing.assert_array_equal(episodes.success, [success] * 3)
     np.testing.assert_array_equal(episodes.episode_return, [total] * 3)
     np.testing.assert_array_equal(episodes.length, [length] * 3)
+    assert episodes.score is None and "eval/score" not in summary(Episodes(*(x[None] for x in episodes[:3])))
+
+
+class ScoredLine(Line):
+    """The share of the way to the goal is a score."""
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        return state.replace(metrics=state.metrics | {"score": jnp.zeros(())})
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        return state.replace(metrics=state.metrics | {"score": jnp.minimum(state.pipeline_state / self.goal, 1.0)})
+
+
+@pytest.mark.parametrize(("goal", "score"), [(8.0, 1.0), (40.0, 0.5)])
+def test_a_score_is_that_of_the_episodes_end(goal, score):
+    """Also where the last macro step reaches beyond it: 20 steps are three macro steps of 6, and two more."""
+    env = ScoredLine(goal=goal, cap=20)
+    episodes = evaluate(env, lambda obs: jnp.ones(1), lambda obs, z: z, jax.random.key(0), episodes=2, horizon=6)
+    np.testing.assert_array_equal(episodes.score, [score] * 2)
+    of_members = Episodes(*(x[None] for x in episodes))
+    assert summary(of_members)["eval/score"].tolist() == [score]
 
 
 PRIOR = Prior(jnp.array([1.0, -1.0, 0.0]), jnp.log(jnp.array([0.5, 1.0, 2.0])))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qdos_brax import config as configs
-from qdos_brax.data.device import to_device
+from qdos_brax.data.device import Normaliser, to_device
 from qdos_brax.data.transitions import Transition
 from qdos_brax.high_level.learning import Sources
 from qdos_brax.high_level.online_phase import OnlinePhase
@@ -42,11 +42,15 @@ def plane():
     return data, normaliser, low_level, artifacts
 
 
+def as_it_is(observation):
+    return observation
+
+
 def online_phase(plane, config, labeller=None, bonus=None):
     """(phase, artifacts, keys) for the members of ``config``, on the shared skills."""
     data, normaliser, low_level, artifacts = plane
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
-    bonus = bonus or RNDBonus(RND(2 + low_level.width, config.labels.rnd_hidden, config.labels.rnd_features))
+    bonus = bonus or RNDBonus(RND(2 + low_level.width, config.labels.rnd_hidden, config.labels.rnd_features), as_it_is)
     labeller = labeller or DataReward()
     phase = OnlinePhase(config, PointEnv(), normaliser, low_level, labeller, bonus, steps_per_chunk=100)
     repeated = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), artifacts)
@@ -167,6 +171,10 @@ def test_labels_are_samples_of_the_posterior():
     labels = run_phase(bound(phase, config, data), keys, artifacts)[2]["labels"]
     assert labels.shape == (1, data.starts.shape[0], 2)
     np.testing.assert_allclose(labels[0], np.broadcast_to([0.1, -0.2], labels.shape[1:]), atol=0.005)
+    assert float(labels[0].std(axis=0).min()) > 0
+    phase = LabelPhase(config.skills.horizon, len(data.starts), TrajectorySkills(model, "box"), "mean")
+    labels = run_phase(bound(phase, config, data), phase_keys(np.zeros(1, np.uint32), 0), artifacts)[2]["labels"]
+    np.testing.assert_allclose(labels[0], np.broadcast_to([0.1, -0.2], labels.shape[1:]), atol=1e-6)
 
 
 def rows(size=64):
@@ -182,14 +190,14 @@ def test_offline_rewards_by_hand():
     reward, mask = DataReward().label({}, batch, 0.9)
     np.testing.assert_array_equal(reward, batch.reward)
     np.testing.assert_array_equal(mask, batch.mask)
-    minimum = MinimumReward(RewardModel(3, (8,)), horizon=3, lowest=-1.0)
+    minimum = MinimumReward(RewardModel(3, (8,)), as_it_is, horizon=3, lowest=-1.0)
     reward, _ = minimum.label(minimum.init(jax.random.key(0)), batch, 0.5)
     np.testing.assert_allclose(reward, -1.75)
 
 
 def test_the_reward_model_learns_rewards_and_ends_and_waits_for_its_start():
     batch = rows()
-    labeller = PredictedReward(RewardModel(3, (32,)))
+    labeller = PredictedReward(RewardModel(3, (32,)), as_it_is)
     state = labeller.init(jax.random.key(1))
     waiting = labeller.learn(state, batch, 1e-2, jnp.array(False))
     for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(waiting), strict=True):
@@ -271,3 +279,23 @@ def test_rnd_error_falls_where_it_was_trained_and_stays_elsewhere():
     known = rnd.error(state.predictor, state.target, seen, action).mean()
     unknown = rnd.error(state.predictor, state.target, new, action).mean()
     assert float(known) < 0.01 * float(unknown)
+
+
+def test_bonus_and_reward_model_see_observations_as_they_are_told():
+    """In metres a step of 1 cm is small, in deviations of a column that hardly moves it is a hundred of them."""
+    normaliser = Normaliser(jnp.array([3.0, -1.0]), jnp.array([0.5, 2.0]))
+    raw, action = jnp.array([[3.0, 4.0]]), jnp.ones((1, 1))
+    normal = normaliser(raw)
+    np.testing.assert_allclose(normal, [[0.0, 2.5]])
+    np.testing.assert_allclose(normaliser.restored(normal), raw)
+    rnd, model = RND(3, (8,), 4), RewardModel(3, (8,))
+    row = Transition(normal, action, jnp.zeros(1), jnp.ones(1), normal)
+    for see, seen in ((normaliser.restored, raw), (as_it_is, normal)):
+        bonus, reward = RNDBonus(rnd, see), PredictedReward(model, see)
+        novelty, labels = bonus.init(jax.random.key(0)), reward.init(jax.random.key(1))
+        expected = 8.0 * rnd.error(novelty.predictor, novelty.target, seen, action)
+        earned = bonus.of(novelty, normal, action, {"labels.rnd_coefficient": 8.0})
+        np.testing.assert_allclose(earned, expected, rtol=1e-5)
+        np.testing.assert_allclose(
+            reward.label(labels, row, 0.9)[0], model.predict(labels.params, seen, action)[0], rtol=1e-5
+        )

@@ -74,6 +74,11 @@ class Browser:
         )
         self.point(*box, click=True)
 
+    def press(self, key: str) -> None:
+        """Press a key and let it go."""
+        strokes = [{"type": "keyDown", "value": key}, {"type": "keyUp", "value": key}]
+        self._call("/actions", {"actions": [{"type": "key", "id": "keyboard", "actions": strokes}]})
+
     def console(self) -> list[str]:
         """Return the console's warnings and errors."""
         return [entry["message"] for entry in self._call("/se/log", {"type": "browser"})]

@@ -44,6 +44,8 @@ def arrays_of_member_1() -> dict[str, np.ndarray]:
         "1/latents": np.asarray([[1.0, 0.0, 0.0], [0.0, -4.0, 2.0]]),
         "1/frames": np.zeros((2, 6, 8, 3), np.uint8),
         "1/frame_steps": np.asarray([0, 40]),
+        "1/film": np.frombuffer(b"RIFF", np.uint8),
+        "1/film_speed": np.asarray(3.25, np.float32),
     }
 
 
@@ -89,8 +91,12 @@ def test_everything_found_is_shown(tmp_path: Path) -> None:
     assert skills.data[0]["x"] == [0, 20] and skills.data[0]["z"] == [[1, 0], [0, -4], [0, 2]]
     assert way.data[1]["x"] == [0, 40] and way.data[1]["y"] == [9, 1] and len(path.data[0]["x"]) == 41
     assert [image.title for image in episode.images] == ["step 0", "step 40"]
+    assert episode.images[1].description == "The scene at step 40 (1.0 from the goal)"
+    (film,) = episode.films
+    assert film.title == "the whole episode, 3.2 times as fast" and film.source == "data:image/webp;base64,UklGRg=="
+    assert film.description.endswith("qdos, seed 1, from step 0 (9.0 from the goal) to step 40 (1.0 from the goal)")
     write_page(study, analyses, tmp_path / "report.html")
-    assert (tmp_path / "report.html").read_text().count('<img src="data:image/jpeg;base64,') == 2
+    assert (tmp_path / "report.html").read_text().count('<img src="data:image/jpeg;base64,') == 2 + 1
 
 
 def test_what_was_not_found_is_left_out(tmp_path: Path) -> None:
@@ -108,8 +114,8 @@ MISSING = [
     ["goal", "quality"],
     ["walls", "gain"],
     ["return", "1/grid", "1/latents"],
-    ["quality_names", "1/between", "1/left"],
-    ["1/weight", "1/path"],
+    ["quality_names", "1/between", "1/left", "1/film"],
+    ["1/weight", "1/path", "1/film_speed"],
     ["1/tsne", "1/frames"],
     ["1/latent", "1/frame_steps"],
     OF_MAZES,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from qdos_brax.report.video import webp
 from qdos_brax.report.write import write_report
 from tests.report.browser import CHROMIUM, DRIVER, Browser, browser, running_driver
 from tests.report.folders import write_run
@@ -27,7 +29,7 @@ SHOWN = f"return {CURVES}.querySelector('.chart').data.filter(t => t.visible && 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A page of three alphas by three seeds, with one frozen member and 600 analysed segments."""
+    """A page of three alphas by three seeds, all analysed and filmed, with one frozen and 600 segments each."""
     folder = tmp_path_factory.mktemp("page")
     goals = [100, None, 300, 400, 500, 600, None, 800, 900]
     success = {0.1: [0.5, 0.6, 0.4], 0.2: [0.7, 0.8, 0.9], 0.3: [0.3, 0.2, 0.1]}
@@ -35,19 +37,24 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(0)
     segments, grid = 600, [(4.0 * x, 4.0 * y) for x in range(8) for y in range(8) if x in (0, 7) or y in (0, 7)]
     arrays: dict[str, Any] = {
-        "members": np.arange(3), "goal": np.array([20.0, 20.0]), "walls": np.asarray(grid),
+        "members": np.arange(9), "goal": np.array([20.0, 20.0]), "walls": np.asarray(grid),
         "return": rng.normal(size=segments), "gain": rng.normal(size=segments),
         "quality": rng.integers(0, 4, segments),
         "quality_names": np.asarray(["navigate", "noisy", "wander", "fail"]),
     }  # fmt: skip
-    for i in range(3):
+    # Scenes that drift, and films of them as large as those of episodes (150 kB).
+    scene = np.kron(rng.integers(0, 255, (8, 10, 3)).astype(np.uint8), np.ones((30, 32, 1), np.uint8))
+    scenes = np.stack([np.roll(scene, i, axis=1) for i in range(60)])
+    film = np.frombuffer(webp(scenes, fps=10), np.uint8)
+    assert film.size > 140_000
+    for i in range(9):
         own = {
             "weight": np.exp(rng.normal(size=segments)), "tsne": rng.normal(size=(segments, 2)),
             "grid": 4 + rng.normal(size=(25, 61, 2)).cumsum(axis=1) / 4,
             "between": 4 + rng.normal(size=(9, 61, 2)).cumsum(axis=1) / 4,
             "path": 4 + rng.normal(size=(1001, 2)).cumsum(axis=0) / 9, "left": np.linspace(30, 0, 1001),
             "latents": rng.normal(size=(50, 8)), "frame_steps": np.linspace(0, 1000, 6).astype(int),
-            "frames": rng.integers(0, 255, (6, 240, 240, 3)).astype(np.uint8),
+            "frames": scenes[:6], "film": film, "film_speed": np.float32(8),
         }  # fmt: skip
         arrays |= {f"{i}/{name}": array for name, array in own.items()}
     np.savez_compressed(run / "inside.npz", **arrays)
@@ -84,6 +91,7 @@ def test_page_in_a_browser(page: Path, driver: str) -> None:
         _hover(window)
         _filter(window)
         _switch_colours(window)
+        _play_film(window)
         assert window.console() == []
         requested = window.requested()
         assert requested and {address[:5] for address in requested} <= {"file:", "data:", "blob:"}
@@ -107,6 +115,19 @@ def test_an_error_or_a_request_would_be_seen(tmp_path: Path, driver: str) -> Non
         window.open(tmp_path / "wrong.html")
         assert any("nonsense" in line for line in window.console())
         assert any(address.startswith("http:") for address in window.requested())
+
+
+@pytest.mark.parametrize("width", [1280, 420])
+def test_the_page_can_be_used_without_a_mouse_or_eyes(page: Path, driver: str, width: int) -> None:
+    with browser(driver, width) as window:
+        window.open(page)
+        for lacking in ("img:not([alt])", ".chart:not([aria-label])", "nav:not([aria-label])", "th:not([scope])"):
+            assert window.run("return document.querySelectorAll(arguments[0]).length", lacking) == 0, lacking
+        # What scrolls sideways can be reached and named; headings do not skip a level.
+        sideways = "[...document.querySelectorAll('.scroll')]"
+        assert window.run(f"return {sideways}.every(x => x.tabIndex === 0 && x.ariaLabel)")
+        levels = window.run("return [...document.querySelectorAll('h1, h2, h3')].map(h => Number(h.tagName[1]))")
+        assert levels[0] == 1 and all(after - before <= 1 for before, after in itertools.pairwise(levels))
 
 
 def _walk(window: Browser) -> None:
@@ -145,6 +166,19 @@ def _filter(window: Browser) -> None:
     assert set(window.run(SHOWN)) == everyone
     assert window.run("return [...document.querySelectorAll('.box[hidden]')].length") == 0
     window.click(".filter summary")
+
+
+def _play_film(window: Browser) -> None:
+    """Start and stop a film with the keyboard: it is decoded, and the picture stands still again."""
+    window.run("document.querySelector('[data-play]').focus()")
+    shown = "const film = document.querySelector('.film img'); return film.complete && film.naturalWidth && film.src"
+    still = window.wait(shown)
+    assert still.startswith("data:image/jpeg")
+    window.press(" ")
+    assert window.wait(shown).startswith("data:image/webp")
+    assert window.run("return document.querySelector('[data-play]').textContent") == "Stop"
+    window.press(" ")
+    assert window.wait(shown) == still
 
 
 def _switch_colours(window: Browser) -> None:

@@ -12,6 +12,8 @@ import pytest
 
 from qdos_brax.commands import main as commands
 from qdos_brax.report.next_step import advise
+from qdos_brax.report.published import published_tables
+from qdos_brax.report.result_sections import learning_section
 from qdos_brax.report.series import curves, scans, surfaces
 from qdos_brax.report.study import read_study
 from qdos_brax.report.summary_cards import summary_cards
@@ -94,6 +96,16 @@ def test_tables_by_hand(tmp_path: Path) -> None:
     assert {file.name for file in report.files} == {file.name for file in (tmp_path / "out").iterdir()}
 
 
+def test_the_papers_figures_stand_beside_runs_of_its_tasks(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / env, env=env) for env in ("antsoccer-arena-task1", "antmaze-large-task1")]
+    success, first_goal = published_tables(read_study(runs).tasks)
+    assert success.header == ["method", "antmaze-large-task1", "antsoccer-arena-task1"]
+    assert success.rows[-1] == ["qdos 0.3", "96 ± 6", "80 ± 10"] and success.rows[0] == ["bc", "41", "5"]
+    assert first_goal.header == ["method", "antmaze-large-task1"] and len(first_goal.rows) == 2
+    assert "Published: success (%)" in write_report(runs, tmp_path / "out").text
+    assert published_tables(["antsoccer-arena-task4", "antmaze-medium-task1"]) == []
+
+
 def test_curves_meet_the_members_in_the_middle(tmp_path: Path) -> None:
     study = read_study([write_run(tmp_path / "a", success=[0.4, 0.8])])
     (curve,) = curves(study, "antmaze-medium-task1", "eval/success")
@@ -101,6 +113,20 @@ def test_curves_meet_the_members_in_the_middle(tmp_path: Path) -> None:
     np.testing.assert_allclose(curve.mean, [0.15, 0.3, 0.6])
     # Two members: the interval's ends are the members themselves, for each is drawn twice in a quarter of the cases.
     np.testing.assert_allclose([curve.low, curve.high], [[0.1, 0.2, 0.4], [0.2, 0.4, 0.8]])
+
+
+def test_a_score_has_panels_of_its_own_where_there_is_one(tmp_path: Path) -> None:
+    plain, scored = write_run(tmp_path / "a"), write_run(tmp_path / "b", env="kitchen-mixed-task1")
+    metrics = scored / "metrics.csv"
+    header, *lines = metrics.read_text().splitlines()
+    rows = [f"{line},{0.25 * index if ',online,' in line else ''}" for index, line in enumerate(lines)]
+    metrics.write_text("\n".join([header + ",eval/score", *rows]) + "\n")
+    names = {
+        path: [figure.title for figure in learning_section(read_study([path])).figures] for path in (plain, scored)
+    }
+    assert names == {plain: ["success", "return"], scored: ["success", "score", "return"]}
+    (curve,) = curves(read_study([scored]), "kitchen-mixed-task1", "eval/score")
+    np.testing.assert_allclose(curve.mean, [0.5, 0.75, 1.0])
 
 
 def test_scan_by_hand(tmp_path: Path) -> None:

@@ -1,0 +1,47 @@
+"""Data as a Minari set: what Minari itself and our reader find in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import envs
+from qdos_brax.commands.main import main
+from qdos_brax.data import formats
+
+SOURCE = Path(__file__).parent / "files" / "ogbench-antmaze-medium.npz"
+
+
+def test_minari_and_our_reader_find_the_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = pytest.importorskip("minari")
+    out = tmp_path / "sets" / "antmaze-medium-v0"
+    command = ["data", "export", str(SOURCE), "--env", "antmaze-medium", "--out", str(out)]
+    assert main(command) == 0 and main(command) == 0  # a second time: it is replaced
+    env = envs.make("antmaze-medium", physics="mujoco")
+    before, after = formats.read(SOURCE, env), formats.read(out, env)
+    for name in ("observations", "actions", "rewards", "masks", "ends", "next_observations", "qpos", "qvel"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name), err_msg=name)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(out.parent))
+    found = minari.load_dataset("antmaze-medium-v0")
+    assert (found.total_episodes, found.total_steps) == (before.num_episodes, before.size)
+    for episode, (first, stop) in zip(found.iterate_episodes(), before.episode_bounds, strict=True):
+        np.testing.assert_array_equal(episode.observations[:-1], before.observations[first:stop])
+        np.testing.assert_array_equal(episode.observations[-1], before.next_observations[stop - 1])
+        np.testing.assert_array_equal(episode.actions, before.actions[first:stop])
+        np.testing.assert_array_equal(episode.rewards, before.rewards[first:stop])
+        assert episode.truncations.tolist() == [False] * (stop - first - 1) + [True]
+        assert not episode.terminations.any()
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+@pytest.mark.parametrize("name", ["antmaze", "taken-v0"])
+def test_a_folder_of_another_name_or_content_is_refused(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "taken-v0").mkdir()
+    assert main(["data", "export", str(SOURCE), "--env", "antmaze-medium", "--out", str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert (len(error.splitlines()) == 1 and "antmaze-medium-v0" in error) or "no Minari set" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["taken-v0"] and not any((tmp_path / "taken-v0").iterdir())
