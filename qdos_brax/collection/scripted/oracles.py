@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from envs.manipulation.manipspace import ManipSpaceTask
-from qdos_brax.collection.scripted.table import TableView, Target
+from qdos_brax.collection.scripted.table import TableTarget, TableView
 
 CONTROL_STEP = 0.05  # s
 MOVE = np.array([0.05, 0.05, 0.05, 0.3, 1.0])
@@ -38,7 +38,7 @@ class Oracle:
         self._oracle: Any = None
         self._steps = 0
 
-    def set_target(self, table: TableView, target: Target, rng: np.random.Generator) -> None:
+    def set_target(self, table: TableView, target: TableTarget, rng: np.random.Generator) -> None:
         """Start with a target; ``rng`` draws the times of the plan, its way, and where the hand goes in the end."""
         self._target, self._steps = target, 0
         self._oracle = _oracle_class(self._style, target.kind)(env=self._env)

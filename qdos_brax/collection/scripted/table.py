@@ -21,7 +21,7 @@ _DRAWER_LOW, _DRAWER_HIGH = np.array([0.21, -0.27, 0.0]), np.array([0.45, -0.07,
 
 
 @dataclass(frozen=True)
-class Target:
+class TableTarget:
     """Describe one thing to do.
 
     Attributes:
@@ -113,7 +113,7 @@ class TableView:
         """Return the cubes that can be picked up: nothing lies on them, and they are not in the drawer."""
         return [i for i in range(len(self.cubes)) if not self._covered(i) and not self.in_drawer(i)]
 
-    def info(self, target: Target, time: float) -> dict[str, Any]:
+    def info(self, target: TableTarget, time: float) -> dict[str, Any]:
         """Return what OGBench's oracles read at ``time`` (s) of their plan."""
         seen: dict[str, Any] = {
             "time": [time],
