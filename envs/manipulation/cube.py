@@ -28,6 +28,11 @@ class Cube(ManipSpaceTask):
         """Return float64[3 c], the places of the cubes."""
         return np.asarray(description["goal_xyzs"], np.float64).ravel()
 
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the cubes."""
+        return [f"cube {index}" for index in range(self.cubes)]
+
     def start_of(self, description: dict[str, Any]) -> TableState:
         """Return the cubes about where they start."""
         return _cubes_alone(description["init_xyzs"])

@@ -84,6 +84,11 @@ class ManipSpaceTask(Task):
     def in_place(self, qpos: Any, goal: Any, extra: Any = None) -> Any:
         """Return bool[..., k], which things are in place, at ``qpos[..., nq]``; NumPy or jax."""
 
+    @property
+    @abstractmethod
+    def names(self) -> list[str]:
+        """Return the names of the things that ``in_place`` is about, in its order."""
+
     @abstractmethod
     def start_of(self, description: dict[str, Any]) -> TableState:
         """Return about where everything is at a start of a task."""
@@ -140,6 +145,11 @@ class ManipSpaceTask(Task):
     def distance_left(self, qpos: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
         """Return float64[...], how many things are not in place."""
         return (~self.in_place(qpos, self._goal, extra)).sum(axis=-1).astype(np.float64)
+
+    def parts(self, states: SimulatorStates) -> dict[str, Any]:
+        """Return bool[...] by the name of each thing, whether it is in place."""
+        placed = self.in_place(states.qpos, self._goal, states.extra)
+        return {name: placed[..., index] for index, name in enumerate(self.names)}
 
     def scene(self) -> Scene:
         """Return the table with the goals of the cubes as ghosts, seen from the front or closer."""

@@ -45,6 +45,11 @@ class SceneTask(ManipSpaceTask):
         slides = abs(qpos[..., _SLIDES : _SLIDES + 2] - goal[..., 5:]) <= NEAR
         return xp.concatenate([cube, xp.broadcast_to(extra == goal[..., 3:5], slides.shape), slides], axis=-1)
 
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the cube, the buttons, the drawer and the window."""
+        return ["cube", "button 0", "button 1", "drawer", "window"]
+
     def start_of(self, description: dict[str, Any]) -> TableState:
         """Return about where everything starts."""
         return _table_state(description["init"])

@@ -5,6 +5,7 @@ import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import h5py
@@ -100,6 +101,45 @@ def test_relabelling_equals_ogbench_for_every_maze(name: str) -> None:
     np.testing.assert_array_equal(ours.rewards, expected["rewards"])
     np.testing.assert_array_equal(ours.masks, expected["masks"])
     assert 8 < (ours.rewards == 0).sum() < n // 2  # the ring's inner half
+
+
+@pytest.mark.parametrize("name", ["cube-double-task3", "scene-task4"])
+def test_button_states_are_kept_and_relabelling_equals_ogbench(name: str, tmp_path: Path) -> None:
+    """Everything in place, or off by a little or much, in a file as published: T + 1 rows per trajectory."""
+    env: Any = envs.make(name, physics="mujoco")
+    rng, n = np.random.default_rng(0), 400
+    placed = env.goal_state(env.description)
+    qpos = np.tile(env.engine.model.qpos0, (n, 1)).astype(np.float32)
+    for index, place in enumerate(placed.cubes):
+        qpos[:, 14 + 7 * index : 17 + 7 * index] = place
+    if len(placed.fixtures):
+        qpos[:, 21:] = placed.fixtures
+    qpos[:, 14:] += rng.choice([0.0, 0.02, 0.1], (n, 1)) * rng.uniform(-1, 1, (n, env.engine.nq - 14))
+    extra = np.where(rng.uniform(size=(n, len(placed.extra))) < 0.7, placed.extra, 1 - placed.extra)
+    stored = {
+        "observations": np.zeros((n, env.observation_size), np.float32),
+        "actions": np.zeros((n, 5), np.float32),
+        "terminals": np.arange(n) % 100 == 99,
+        "qpos": qpos,
+        "qvel": np.zeros((n, env.engine.nv), np.float32),
+    } | ({"button_states": extra} if extra.size else {})
+    np.savez(tmp_path / "set.npz", **stored)
+
+    base, task = name.rsplit("-", 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        theirs = gymnasium.make(f"{base}-singletask-{task}-v0")
+    expected = load_dataset(str(tmp_path / "set.npz"), add_info=True)
+    relabel_dataset(f"{base}-singletask", theirs, expected)
+
+    rows = formats.load(tmp_path / "set.npz")
+    ours = label(rows, env, name)
+    if extra.size:
+        assert rows.extra is not None and rows.extra.dtype == np.int32
+        np.testing.assert_array_equal(rows.extra, expected["button_states"])
+    np.testing.assert_array_equal(ours.rewards, expected["rewards"])
+    np.testing.assert_array_equal(ours.masks, expected["masks"])
+    assert 0 < (ours.masks == 0).sum() < n and len(np.unique(ours.rewards)) >= 3
 
 
 # --- Minari ---

@@ -137,6 +137,9 @@ def test_rewards_of_data_are_those_of_steps() -> None:
     rows = SimpleNamespace(qpos=held.qpos[:-1], qvel=held.qvel[:-1], extra=held.extra[:-1])
     np.testing.assert_array_equal(env.labels(rows)[0], states.reward[1:])
     np.testing.assert_array_equal(-env.distance_left(rows.qpos, rows.extra), states.reward[1:])
+    parts = env.parts(rows)
+    assert list(parts) == ["cube", "button 0", "button 1", "drawer", "window"]
+    np.testing.assert_array_equal(sum(np.asarray(part, int) for part in parts.values()) - 5, states.reward[1:])
     flipped = SimpleNamespace(qpos=rows.qpos, qvel=rows.qvel, extra=1 - rows.extra)
     np.testing.assert_array_equal(env.labels(flipped)[0], states.reward[1:] - 2)
     on_device = SimpleNamespace(qpos=jnp.asarray(rows.qpos), qvel=None, extra=jnp.asarray(flipped.extra))

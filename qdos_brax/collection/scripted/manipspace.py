@@ -10,7 +10,7 @@ from envs.manipulation.manipspace import SHIFT, ManipSpaceTask, TableState
 from envs.manipulation.manipspace_rig import ROBOT_JOINTS
 from qdos_brax.collection.scripted.demonstrator import SimStates
 from qdos_brax.collection.scripted.oracles import MOVE, Oracle
-from qdos_brax.collection.scripted.table import Table, TableReader
+from qdos_brax.collection.scripted.table import TableReader, TableView
 from qdos_brax.collection.scripted.targets import LYING, GoalSeeker, any_target
 
 AIMED_SHARE = 0.75
@@ -24,7 +24,7 @@ _RANGES = np.array([[0.0, 0.0, -0.16, 0.0], [0.0, 0.0, 0.0, 0.2]])  # of the sce
 
 
 class CubeDemonstrator:
-    """Demonstrate the cubes.
+    """Play the cubes.
 
     Good episodes (``navigate``) follow OGBench's plan oracles with smooth noise. A share of them, ``AIMED_SHARE``,
     starts where one of the tasks starts and does what the tasks' goals ask for; the others take random targets, as
@@ -53,9 +53,9 @@ class CubeDemonstrator:
         self._players = [_PLAYERS[int(kind)](self._env, self._noise, rng) for kind in kinds]
         tables = [player.start(rng) for player in self._players]
         qpos = np.zeros((self._n, self._env.engine.nq))
-        qpos[:, :6] = self._env.rig.arm_start(
-            rng.uniform(*self._env.space.arm_bounds, (self._n, 3)), rng.uniform(-np.pi, np.pi, self._n)
-        )
+        low, high = self._env.space.arm_bounds
+        hands, yaws = rng.uniform(low, high, (self._n, 3)), rng.uniform(-np.pi, np.pi, self._n)
+        qpos[:, :6] = self._env.rig.arm_start(hands, yaws)
         qpos[:, ROBOT_JOINTS:] = [_table_qpos(table, rng) for table in tables]
         extra = np.array([table.extra for table in tables], np.int32)
         return SimStates(qpos, np.zeros((self._n, self._env.engine.nv)), extra, np.zeros((self._n, 0), np.float32))
@@ -70,7 +70,7 @@ class CubeDemonstrator:
 
 
 class SceneDemonstrator(CubeDemonstrator):
-    """Demonstrate the scene, in the same ways."""
+    """Play the scene, in the same ways."""
 
 
 class _Player:
@@ -91,13 +91,13 @@ class _Player:
         """Return where things are at first."""
         return _random_table(self._env, rng)
 
-    def act(self, table: Table, rng: np.random.Generator) -> np.ndarray:
+    def act(self, table: TableView, rng: np.random.Generator) -> np.ndarray:
         """Return the action float64[5]."""
         if self._oracle.done:
             self._aim(table, rng)
         return self._oracle.act(table)
 
-    def _aim(self, table: Table, rng: np.random.Generator) -> None:
+    def _aim(self, table: TableView, rng: np.random.Generator) -> None:
         """Set the next target."""
         self._oracle.set_target(table, any_target(self._env, table, rng), rng)
 
@@ -124,10 +124,10 @@ class _Good(_Player):
         cubes[:, :2] += rng.uniform(-SHIFT, SHIFT, (len(cubes), 2))
         fixtures = state.fixtures
         if len(fixtures):
-            fixtures = np.clip(fixtures + [0, 0, *rng.uniform(-SHIFT, SHIFT, 2)], *_RANGES)
+            fixtures = np.clip(fixtures + rng.uniform(-SHIFT, SHIFT, len(fixtures)), *_RANGES)
         return TableState(cubes, fixtures, state.extra)
 
-    def _aim(self, table: Table, rng: np.random.Generator) -> None:
+    def _aim(self, table: TableView, rng: np.random.Generator) -> None:
         if not self._aimed:
             return super()._aim(table, rng)
         target = self._seekers[self._task].next_target(table, rng)
@@ -148,7 +148,7 @@ class _Failing(_Good):
     def start(self, rng: np.random.Generator) -> TableState:
         return self._env.goal_state(self._env.descriptions[self._task])
 
-    def act(self, table: Table, rng: np.random.Generator) -> np.ndarray:
+    def act(self, table: TableView, rng: np.random.Generator) -> np.ndarray:
         if self._retreat == 0 and (self._oracle.done or self._oracle.progress() < self._let_go):
             return super().act(table, rng)
         self._retreat = self._retreat or _RETREAT
@@ -157,7 +157,7 @@ class _Failing(_Good):
             self._aim(table, rng)
         return np.array([0.0, 0.0, 1.0, 0.0, -1.0])
 
-    def _aim(self, table: Table, rng: np.random.Generator) -> None:
+    def _aim(self, table: TableView, rng: np.random.Generator) -> None:
         target = self._seekers[self._task].next_target(table, rng)
         if target is None or rng.uniform() < _WRONG_SHARE:
             self._let_go, target = 1.1, any_target(self._env, table, rng)
@@ -174,7 +174,7 @@ class _Wandering(_Player):
         self.action_noise = noise
         self._left, self._place, self._yaw, self._grip = 0, np.zeros(3), 0.0, 0.0
 
-    def act(self, table: Table, rng: np.random.Generator) -> np.ndarray:
+    def act(self, table: TableView, rng: np.random.Generator) -> np.ndarray:
         if self._left == 0 or np.linalg.norm(self._place - table.hand) < 0.03:
             low, high = self._env.space.arm_bounds
             self._left = _WAYPOINT_STEPS

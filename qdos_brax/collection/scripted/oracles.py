@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from envs.manipulation.manipspace import ManipSpaceTask
-from qdos_brax.collection.scripted.table import Table, Target
+from qdos_brax.collection.scripted.table import TableTarget, TableView
 
 CONTROL_STEP = 0.05  # s
 MOVE = np.array([0.05, 0.05, 0.05, 0.3, 1.0])
@@ -22,7 +22,7 @@ _SMOOTHING = 0.5  # control steps, of the noise on a plan, as in OGBench
 
 
 class Oracle:
-    """Carry out one target after another in one simulation.
+    """Do one thing after another in one simulation.
 
     ``plan`` follows a path that was laid out when the target was set, with smooth noise on it; it never looks again.
     ``markov`` acts on what it sees.
@@ -38,8 +38,8 @@ class Oracle:
         self._oracle: Any = None
         self._steps = 0
 
-    def set_target(self, table: Table, target: Target, rng: np.random.Generator) -> None:
-        """Begin with a target; ``rng`` draws the times of the plan, its way, and where the hand goes in the end."""
+    def set_target(self, table: TableView, target: TableTarget, rng: np.random.Generator) -> None:
+        """Start with a target; ``rng`` draws the times of the plan, its way, and where the hand goes in the end."""
         self._target, self._steps = target, 0
         self._oracle = _oracle_class(self._style, target.kind)(env=self._env)
         with _numpy_draws_from(rng):
@@ -57,7 +57,7 @@ class Oracle:
         """Return how much of a plan is over, 0 to 1."""
         return float(self._steps / len(self._oracle._plan))
 
-    def act(self, table: Table) -> np.ndarray:
+    def act(self, table: TableView) -> np.ndarray:
         """Return the action float64[5] within [-1, 1]."""
         action = self._oracle.select_action(None, table.info(self._target, self._steps * CONTROL_STEP))
         self._steps += 1
@@ -72,16 +72,14 @@ def _oracle_class(style: str, kind: str) -> Any:
     if style == "markov":
         return found
 
-    class Planner(found):
-        def __init__(self, env: Any) -> None:
-            super().__init__(env=env, noise=0.0)
+    return type("Planner", (found,), {"compute_plan": _compute_plan})
 
-        def compute_plan(self, times: list[float], poses: list[Any], grasps: list[float]) -> np.ndarray:
-            places = np.array([pose.translation() for pose in poses])
-            yaws = np.array([pose.rotation().compute_yaw_radians() for pose in poses])
-            return lay_out(np.array(times), places, yaws, np.array(grasps))
 
-    return Planner
+def _compute_plan(oracle: Any, times: list[float], poses: list[Any], grasps: list[float]) -> np.ndarray:
+    """Stand for OGBench's method of that name, without noise."""
+    places = np.array([pose.translation() for pose in poses])
+    yaws = np.array([pose.rotation().compute_yaw_radians() for pose in poses])
+    return lay_out(np.array(times), places, yaws, np.array(grasps))
 
 
 def lay_out(times: np.ndarray, places: np.ndarray, yaws: np.ndarray, grasps: np.ndarray) -> np.ndarray:

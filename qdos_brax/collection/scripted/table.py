@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,20 +20,21 @@ _DRAWER_LOW, _DRAWER_HIGH = np.array([0.21, -0.27, 0.0]), np.array([0.45, -0.07,
 """m, of the inside of the drawer; y relative to its handle."""
 
 
-class Target(NamedTuple):
+@dataclass(frozen=True)
+class TableTarget:
     """Describe one thing to do.
 
     Attributes:
         kind: "cube", "button", "drawer" or "window".
         index: which cube or button.
-        place: float64[3], where the cube shall be.
+        place: float64[3], where the cube shall be, in m.
         yaw: how the cube shall be turned, in rad.
         value: what the button (0 or 1), the drawer or the window (m) shall be.
     """
 
     kind: str
     index: int = 0
-    place: np.ndarray = DRAWER_SPOT
+    place: np.ndarray | None = None
     yaw: float = 0.0
     value: float = 0.0
 
@@ -58,7 +59,8 @@ class Fixtures:
     def of(cls, env: ManipSpaceTask) -> Fixtures:
         """Return those of a task; none for the cubes."""
         if not env.extra_size:
-            return cls(*np.zeros((3, 0, 3)), np.zeros(0))
+            none = np.zeros((0, 3))
+            return cls(none, none, none, np.zeros(0))
         model, data = env.space.whole, mujoco.MjData(env.space.whole)
         handles = [model.site(f"{name.split('_')[0]}_handle_center").id for name in SLIDES]
         mujoco.mj_kinematics(model, data)
@@ -70,7 +72,7 @@ class Fixtures:
 
 
 @dataclass(frozen=True)
-class Table:
+class TableView:
     """Hold one simulation as the oracles see it.
 
     Attributes:
@@ -111,7 +113,7 @@ class Table:
         """Return the cubes that can be picked up: nothing lies on them, and they are not in the drawer."""
         return [i for i in range(len(self.cubes)) if not self._covered(i) and not self.in_drawer(i)]
 
-    def info(self, target: Target, time: float) -> dict[str, Any]:
+    def info(self, target: TableTarget, time: float) -> dict[str, Any]:
         """Return what OGBench's oracles read at ``time`` (s) of their plan."""
         seen: dict[str, Any] = {
             "time": [time],
@@ -158,7 +160,7 @@ class TableReader:
         self._fixtures = Fixtures.of(env)
         self._cubes = (env.engine.nq - ROBOT_JOINTS) // CUBE
 
-    def read(self, states: SimStates) -> list[Table]:
+    def read(self, states: SimStates) -> list[TableView]:
         """Return the table of each simulation."""
         sensed = states.sensed.astype(np.float64)
         hands = sensed[:, 12:15] / PLACE_SCALE + CENTRE
@@ -167,5 +169,17 @@ class TableReader:
         cubes = states.qpos[:, ROBOT_JOINTS:last].reshape(len(hands), self._cubes, CUBE)
         turns = poses.yaw(cubes[..., 3:])
         slides = states.qpos[:, last + states.extra.shape[1] :]
-        columns = (hands, yaws, grips, sensed[:, 18], cubes[..., :3], turns, states.extra, slides)
-        return [Table(*row, self._fixtures) for row in zip(*columns, strict=True)]
+        return [
+            TableView(
+                hand=hands[sim],
+                yaw=yaws[sim],
+                grip=grips[sim],
+                contact=sensed[sim, 18],
+                cubes=cubes[sim, :, :3],
+                cube_yaws=turns[sim],
+                buttons=states.extra[sim],
+                slides=slides[sim],
+                fixtures=self._fixtures,
+            )
+            for sim in range(len(hands))
+        ]

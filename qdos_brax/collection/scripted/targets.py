@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from envs.manipulation.manipspace import NEAR, ManipSpaceTask
-from qdos_brax.collection.scripted.table import DRAWER_SPOT, Table, Target
+from qdos_brax.collection.scripted.table import DRAWER_SPOT, TableTarget, TableView
 
 LYING = 0.02  # m, of the centre of a cube on the table
 _CUBE_SIZE = 0.04  # m
@@ -18,7 +18,7 @@ _DRAWER_OPEN, _WINDOW_OPEN = -0.16, 0.2  # m
 _LOCKED_WEIGHT = 0.25  # of moving what is locked; 1 for everything else
 
 
-def any_target(env: ManipSpaceTask, table: Table, rng: np.random.Generator) -> Target:
+def any_target(env: ManipSpaceTask, table: TableView, rng: np.random.Generator) -> TableTarget:
     """Return a random thing to do, by the shares of OGBench's play data."""
     cubes = table.top_cubes()
     kinds = {"cube": float(bool(cubes))}
@@ -31,20 +31,20 @@ def any_target(env: ManipSpaceTask, table: Table, rng: np.random.Generator) -> T
         return _any_cube(env, table, cubes, rng)
     if kind == "button":
         button = int(rng.integers(len(table.buttons)))
-        return Target("button", button, value=1 - table.buttons[button])
+        return TableTarget("button", button, value=1 - table.buttons[button])
     if kind == "drawer":
-        return Target("drawer", value=_DRAWER_OPEN if table.slides[0] >= _DRAWER_OPEN / 2 else 0.0)
-    return Target("window", value=_WINDOW_OPEN if table.slides[1] <= _WINDOW_OPEN / 2 else 0.0)
+        return TableTarget("drawer", value=_DRAWER_OPEN if table.slides[0] >= _DRAWER_OPEN / 2 else 0.0)
+    return TableTarget("window", value=_WINDOW_OPEN if table.slides[1] <= _WINDOW_OPEN / 2 else 0.0)
 
 
-def _any_cube(env: ManipSpaceTask, table: Table, cubes: list[int], rng: np.random.Generator) -> Target:
+def _any_cube(env: ManipSpaceTask, table: TableView, cubes: list[int], rng: np.random.Generator) -> TableTarget:
     cube, yaw = int(rng.choice(cubes)), float(rng.uniform(0, 2 * np.pi))
     others = [other for other in cubes if other != cube]
     if len(table.slides) and table.slides[0] < 0.75 * _DRAWER_OPEN and rng.uniform() < _INTO_DRAWER:
-        return Target("cube", cube, _drawer_spot(rng), yaw)
+        return TableTarget("cube", cube, _drawer_spot(rng), yaw)
     if others and rng.uniform() < _STACKED:
-        return Target("cube", cube, table.cubes[rng.choice(others)] + [0.0, 0.0, _CUBE_SIZE], yaw)
-    return Target("cube", cube, np.array([*rng.uniform(*env.space.object_bounds), LYING]), yaw)
+        return TableTarget("cube", cube, table.cubes[rng.choice(others)] + [0.0, 0.0, _CUBE_SIZE], yaw)
+    return TableTarget("cube", cube, np.array([*rng.uniform(*env.space.object_bounds), LYING]), yaw)
 
 
 def _drawer_spot(rng: np.random.Generator) -> np.ndarray:
@@ -52,7 +52,7 @@ def _drawer_spot(rng: np.random.Generator) -> np.ndarray:
 
 
 class GoalSeeker:
-    """Choose the next thing to do on the way to the goal of one task of a variant.
+    """Decide what to do next on the way to the goal of one task of a variant.
 
     Args:
         env: any task of the variant.
@@ -66,57 +66,57 @@ class GoalSeeker:
         # A place that high is in the drawer, unless it is on another cube.
         self._into_drawer = env.extra_size > 0 and self.goal.cubes[0, 2] > 2 * LYING
 
-    def feasible(self, table: Table) -> bool:
+    def feasible(self, table: TableView) -> bool:
         """Return whether it can be reached: no oracle takes a cube out of the drawer."""
         return self._into_drawer or not table.in_drawer(0)
 
-    def next_target(self, table: Table, rng: np.random.Generator) -> Target | None:
+    def next_target(self, table: TableView, rng: np.random.Generator) -> TableTarget | None:
         """Return the next thing to do; None where everything is in place."""
         if not len(table.slides):
             return self._next_cube(table, rng)
         if self._into_drawer and not table.in_drawer(0):
             ready = table.slides[0] < 0.75 * _DRAWER_OPEN
             return (
-                Target("cube", 0, _drawer_spot(rng), rng.uniform(0, 2 * np.pi))
+                TableTarget("cube", 0, _drawer_spot(rng), rng.uniform(0, 2 * np.pi))
                 if ready
                 else self._slide(table, 0, _DRAWER_OPEN)
             )
         if not self._into_drawer and not self._placed(table)[0]:
-            return Target("cube", 0, self.goal.cubes[0], rng.uniform(0, 2 * np.pi))
+            return TableTarget("cube", 0, self.goal.cubes[0], rng.uniform(0, 2 * np.pi))
         for index, value in enumerate(self._slides):
             if abs(table.slides[index] - value) > NEAR / 2:
                 return self._slide(table, index, value)
         wrong = np.flatnonzero(table.buttons != self.goal.extra)
-        return Target("button", int(wrong[0]), value=int(self.goal.extra[wrong[0]])) if len(wrong) else None
+        return TableTarget("button", int(wrong[0]), value=int(self.goal.extra[wrong[0]])) if len(wrong) else None
 
-    def _placed(self, table: Table) -> np.ndarray:
+    def _placed(self, table: TableView) -> np.ndarray:
         return np.asarray(np.linalg.norm(table.cubes - self.goal.cubes, axis=1) <= NEAR)
 
-    def _slide(self, table: Table, index: int, value: float) -> Target:
+    def _slide(self, table: TableView, index: int, value: float) -> TableTarget:
         """Return the move of the drawer or the window, or the button that has to be pressed before."""
         if table.buttons[index] == 0:
-            return Target("button", index, value=1)
-        return Target(("drawer", "window")[index], value=float(value))
+            return TableTarget("button", index, value=1)
+        return TableTarget(("drawer", "window")[index], value=float(value))
 
-    def _next_cube(self, table: Table, rng: np.random.Generator) -> Target | None:
+    def _next_cube(self, table: TableView, rng: np.random.Generator) -> TableTarget | None:
         placed = self._placed(table)
         if placed.all():
             return None
         waiting = [cube for cube in table.top_cubes() if not placed[cube]]
         for cube in sorted(waiting, key=lambda cube: self.goal.cubes[cube, 2]):
             if self._is_ready(table, cube, placed):
-                return Target("cube", cube, self.goal.cubes[cube], rng.uniform(0, 2 * np.pi))
+                return TableTarget("cube", cube, self.goal.cubes[cube], rng.uniform(0, 2 * np.pi))
         free = waiting or table.top_cubes()
-        return Target("cube", int(rng.choice(free)), self._free_place(table, rng), rng.uniform(0, 2 * np.pi))
+        return TableTarget("cube", int(rng.choice(free)), self._free_place(table, rng), rng.uniform(0, 2 * np.pi))
 
-    def _is_ready(self, table: Table, cube: int, placed: np.ndarray) -> bool:
+    def _is_ready(self, table: TableView, cube: int, placed: np.ndarray) -> bool:
         """Return whether nothing lies where the cube has to be, and what it has to lie on is there."""
         place, others = self.goal.cubes[cube], np.arange(len(placed)) != cube
         if place[2] > 2 * LYING:
             return bool(placed[others].all())
         return bool((np.linalg.norm(table.cubes[others, :2] - place[:2], axis=1) > 1.5 * _CUBE_SIZE).all())
 
-    def _free_place(self, table: Table, rng: np.random.Generator) -> np.ndarray:
+    def _free_place(self, table: TableView, rng: np.random.Generator) -> np.ndarray:
         """Return a place on the table that is not in the way."""
         taken = np.concatenate([table.cubes[:, :2], self.goal.cubes[:, :2]])
         for _ in range(50):

@@ -10,7 +10,7 @@ from qdos_brax.data.readers.rows import Rows, unreadable
 from qdos_brax.data.readers.table import NpzTable
 from qdos_brax.errors import UserError
 
-_OPTIONAL = ("next_observations", "valids", "rewards", "masks", "qpos", "qvel")
+_OPTIONAL = ("next_observations", "valids", "rewards", "masks", "qpos", "qvel", "button_states")
 
 
 def load(path: Path) -> Rows:
@@ -47,6 +47,8 @@ def load(path: Path) -> Rows:
         for key in ("qpos", "qvel"):
             if key in table:
                 setattr(rows, key, table.floats(key, keep)[0])
+        if "button_states" in table:  # the scene's discrete state; other buttons are no task here
+            rows.extra = np.round(table.floats("button_states", keep)[0]).astype(np.int32)
         if "rewards" in table:
             rows.rewards = table.numbers("rewards", keep)
         if "masks" in table:
