@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from envs.families import TaskSpec
-from envs.manipulation.manipspace import CUBE, ManipSpaceTask, near
+from envs.manipulation.manipspace import CUBE, ManipSpaceTask, TableState, near
 from envs.manipulation.manipspace_rig import ROBOT_JOINTS, ManipSpaceRig
 
 
@@ -28,11 +28,19 @@ class Cube(ManipSpaceTask):
         """Return float64[3 c], the places of the cubes."""
         return np.asarray(description["goal_xyzs"], np.float64).ravel()
 
+    def start_of(self, description: dict[str, Any]) -> TableState:
+        """Return the cubes about where they start."""
+        return _cubes_alone(description["init_xyzs"])
+
+    def goal_state(self, description: dict[str, Any]) -> TableState:
+        """Return the cubes in their places."""
+        return _cubes_alone(description["goal_xyzs"])
+
     def in_place(self, qpos: Any, goal: Any, extra: Any = None) -> Any:
         """Return bool[..., c], which cubes are within 4 cm of their place."""
-        cubes = len(self._start_cubes())
-        placed = qpos[..., ROBOT_JOINTS:].reshape(*qpos.shape[:-1], cubes, CUBE)[..., :3]
-        return near(placed, goal.reshape(*goal.shape[:-1], cubes, 3))
+        placed = qpos[..., ROBOT_JOINTS:].reshape(*qpos.shape[:-1], self.cubes, CUBE)[..., :3]
+        return near(placed, goal.reshape(*goal.shape[:-1], self.cubes, 3))
 
-    def _start_cubes(self) -> np.ndarray:
-        return np.asarray(self.description["init_xyzs"], np.float64)
+
+def _cubes_alone(places: Any) -> TableState:
+    return TableState(np.array(places, np.float64), np.zeros(0), np.zeros(0, np.int32))

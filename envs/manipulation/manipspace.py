@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +23,24 @@ CUBE = 7
 """Numbers of qpos per cube: its place and its quaternion."""
 NEAR = 0.04
 """How far from its goal a thing counts as in place, in m."""
-_HIGH = 0.02  # m, of the centre of a cube that lies on the table
-_SHIFT = 0.01  # m, by which starts vary
+SHIFT = 0.01
+"""By how much starts vary, in m."""
 _DIFFERENCE = 2e-3  # between an observation and qpos, in the observation's units; data is float32
 _TABLE = np.array([[0.0, -0.6, -0.2], [0.9, 0.6, 0.6]])  # m, where cubes are while the physics is sound
+
+
+class TableState(NamedTuple):
+    """Hold what is on the table.
+
+    Attributes:
+        cubes: float64[c, 3], their centres, in m.
+        fixtures: float64[k], what follows the cubes in qpos.
+        extra: int32[e], the discrete state.
+    """
+
+    cubes: np.ndarray
+    fixtures: np.ndarray
+    extra: np.ndarray
 
 
 class ManipSpaceTask(Task):
@@ -46,18 +60,21 @@ class ManipSpaceTask(Task):
     distance_margin = 0.5
 
     def __init__(self, spec: TaskSpec, rig_class: type[ManipSpaceRig]) -> None:
-        self._space = manip_space(spec.name)
-        self.rig = rig_class(self._space)
-        self.description = self._space.tasks[spec.task_id - 1]
-        super().__init__(spec, MujocoEngine(self._space.stepped, self.rig, FRAME_SKIP), self.goal_of(self.description))
-        self._arm_start = HostFunction(
-            self._arm_starts, b"arm" + self.rig.identity() + self._space.arm_bounds.tobytes()
-        )
+        self.space = manip_space(spec.name)
+        self.rig = rig_class(self.space)
+        self.description = self.space.tasks[spec.task_id - 1]
+        super().__init__(spec, MujocoEngine(self.space.stepped, self.rig, FRAME_SKIP), self.goal_of(self.description))
+        self.cubes = len(self.start_of(self.description).cubes)
+        self._arm_start = HostFunction(self._arm_starts, b"arm" + self.rig.identity() + self.space.arm_bounds.tobytes())
+
+    @abstractmethod
+    def goal_state(self, description: dict[str, Any]) -> TableState:
+        """Return where everything is at the goal of a task."""
 
     @property
     def descriptions(self) -> list[dict[str, Any]]:
         """Return OGBench's description of each task of the variant."""
-        return self._space.tasks
+        return self.space.tasks
 
     @abstractmethod
     def goal_of(self, description: dict[str, Any]) -> np.ndarray:
@@ -68,8 +85,8 @@ class ManipSpaceTask(Task):
         """Return bool[..., k], which things are in place, at ``qpos[..., nq]``; NumPy or jax."""
 
     @abstractmethod
-    def _start_cubes(self) -> np.ndarray:
-        """Return float64[c, 3], about where the cubes start."""
+    def start_of(self, description: dict[str, Any]) -> TableState:
+        """Return about where everything is at a start of a task."""
 
     def reset(self, rng: jax.Array) -> State:
         """Return a start of the task: the hand anywhere above the table, the cubes where the task has them.
@@ -77,14 +94,16 @@ class ManipSpaceTask(Task):
         Each cube is moved by up to 1 cm in x and y and turned at random.
         """
         keys = jax.random.split(rng, 5)
-        cubes = jnp.asarray(self._start_cubes(), jnp.float32)
-        shift = jax.random.uniform(keys[2], (len(cubes), 2), minval=-_SHIFT, maxval=_SHIFT)
+        start = self.start_of(self.description)
+        cubes = jnp.asarray(start.cubes, jnp.float32)
+        shift = jax.random.uniform(keys[2], (len(cubes), 2), minval=-SHIFT, maxval=SHIFT)
         half = jax.random.uniform(keys[3], (len(cubes), 1), maxval=jnp.pi)
         zero = jnp.zeros_like(half)
         cubes = jnp.concatenate([cubes.at[:, :2].add(shift), jnp.cos(half), zero, zero, jnp.sin(half)], axis=1)
         robot = jnp.concatenate([self._draw_arm(keys[0], keys[1]), jnp.zeros(ROBOT_JOINTS - 6)])
-        qpos = jnp.concatenate([robot, cubes.ravel(), self._start_fixtures(keys[4])])
-        return self.reset_to(qpos, jnp.zeros(self.engine.nv), key=rng, extra=self._start_extra())
+        fixtures = self._draw_fixtures(keys[4], jnp.asarray(start.fixtures, jnp.float32))
+        qpos = jnp.concatenate([robot, cubes.ravel(), fixtures])
+        return self.reset_to(qpos, jnp.zeros(self.engine.nv), key=rng, extra=jnp.asarray(start.extra))
 
     def reset_to(
         self,
@@ -124,9 +143,9 @@ class ManipSpaceTask(Task):
 
     def scene(self) -> Scene:
         """Return the table with the goals of the cubes as ghosts, seen from the front or closer."""
-        model = copy.deepcopy(self._space.whole)
-        for index, place in enumerate(self._goal.reshape(-1)[: 3 * len(self._start_cubes())].reshape(-1, 3)):
-            _paint_goal(model, index, place)
+        model = copy.deepcopy(self.space.whole)
+        for index in range(self.cubes):
+            _paint_goal(model, index, self._goal[3 * index : 3 * index + 3])
         views = {
             "front": fixed_view((0.3, 0.0, 0.15), azimuth=160.0, elevation=-25.0, distance=1.5),
             "near": fixed_view((0.4, 0.0, 0.08), azimuth=160.0, elevation=-30.0, distance=1.1),
@@ -146,7 +165,7 @@ class ManipSpaceTask(Task):
         if rows.qpos is None:
             return []
         found = []
-        for index in range(len(self._start_cubes())):
+        for index in range(self.cubes):
             first = ROBOT_JOINTS + CUBE * index
             place, turn = rows.qpos[:, first : first + 3], rows.qpos[:, first + 3 : first + CUBE]
             if (out := ((place < _TABLE[0]) | (place > _TABLE[1])).any(axis=1)).any():
@@ -155,17 +174,13 @@ class ManipSpaceTask(Task):
                 found.append(f"the quaternion of cube {index} is not of length 1 in {count_rows(bent)}")
         return found
 
-    def _start_fixtures(self, key: jax.Array) -> jax.Array:
-        """Return what follows the cubes in qpos at a start."""
-        return jnp.zeros(0)
-
-    def _start_extra(self) -> jax.Array | None:
-        """Return the discrete state of a start."""
-        return None
+    def _draw_fixtures(self, key: jax.Array, fixtures: jax.Array) -> jax.Array:
+        """Return what follows the cubes in qpos at a start, about at ``fixtures``."""
+        return fixtures
 
     def _draw_arm(self, key: jax.Array, key_yaw: jax.Array) -> jax.Array:
         """Return float32[6], joints with the hand somewhere within the bounds of starts."""
-        low, high = jnp.asarray(self._space.arm_bounds, jnp.float32)
+        low, high = jnp.asarray(self.space.arm_bounds, jnp.float32)
         place = jax.random.uniform(key, (3,), minval=low, maxval=high)
         yaw = jax.random.uniform(key_yaw, (1,), minval=-jnp.pi, maxval=jnp.pi)
         return self._arm_start((jax.ShapeDtypeStruct((6,), jnp.float32),), place, yaw)[0]

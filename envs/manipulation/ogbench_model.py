@@ -28,6 +28,7 @@ class ManipSpace(NamedTuple):
         pinch_to_flange: float64[7], from the pose between the fingers to the flange's: quaternion (w, x, y, z), place.
         arm_home: float64[6], the arm's joints that inverse kinematics starts from in a reset.
         arm_bounds: float64[2, 3], lowest and highest place between the fingers at a start, in m.
+        object_bounds: float64[2, 2], lowest and highest (x, y) where cubes are put on the table, in m.
         tasks: OGBench's description of each task.
     """
 
@@ -37,6 +38,7 @@ class ManipSpace(NamedTuple):
     pinch_to_flange: np.ndarray
     arm_home: np.ndarray
     arm_bounds: np.ndarray
+    object_bounds: np.ndarray
     tasks: list[dict[str, Any]]
 
 
@@ -59,6 +61,7 @@ def manip_space(name: str) -> ManipSpace:
         pinch_to_flange=env._T_pa.wxyz_xyz.copy(),
         arm_home=env._home_qpos.copy(),
         arm_bounds=np.array(env._arm_sampling_bounds, np.float64),
+        object_bounds=np.array(env._object_sampling_bounds, np.float64),
         tasks=env.task_infos,
     )
 

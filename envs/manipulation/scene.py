@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.families import TaskSpec
-from envs.manipulation.manipspace import CUBE, NEAR, ManipSpaceTask, near
+from envs.manipulation.manipspace import CUBE, NEAR, SHIFT, ManipSpaceTask, TableState, near
 from envs.manipulation.manipspace_rig import ROBOT_JOINTS
 from envs.manipulation.scene_rig import SceneRig
 
 _SLIDES = ROBOT_JOINTS + CUBE + 2  # place of the drawer in qpos; the window is next
-_VARIATION = 0.01  # m, by which drawer and window vary at a start
 _RANGES = np.array([[-0.16, 0.0], [0.0, 0.2]])  # m, of drawer and window
 
 
@@ -46,13 +45,21 @@ class SceneTask(ManipSpaceTask):
         slides = abs(qpos[..., _SLIDES : _SLIDES + 2] - goal[..., 5:]) <= NEAR
         return xp.concatenate([cube, xp.broadcast_to(extra == goal[..., 3:5], slides.shape), slides], axis=-1)
 
-    def _start_cubes(self) -> np.ndarray:
-        return np.asarray(self.description["init"]["block_xyzs"], np.float64)
+    def start_of(self, description: dict[str, Any]) -> TableState:
+        """Return about where everything starts."""
+        return _table_state(description["init"])
 
-    def _start_extra(self) -> jax.Array:
-        return jnp.asarray(self.description["init"]["button_states"], jnp.int32)
+    def goal_state(self, description: dict[str, Any]) -> TableState:
+        """Return everything in its place."""
+        return _table_state(description["goal"])
 
-    def _start_fixtures(self, key: jax.Array) -> jax.Array:
-        start = jnp.array([self.description["init"]["drawer_pos"], self.description["init"]["window_pos"]])
-        slides = start + jax.random.uniform(key, (2,), minval=-_VARIATION, maxval=_VARIATION)
-        return jnp.concatenate([jnp.zeros(2), jnp.clip(slides, *jnp.asarray(_RANGES.T, jnp.float32))])
+    def _draw_fixtures(self, key: jax.Array, fixtures: jax.Array) -> jax.Array:
+        shift = jax.random.uniform(key, (2,), minval=-SHIFT, maxval=SHIFT)
+        return fixtures.at[2:].set(jnp.clip(fixtures[2:] + shift, *jnp.asarray(_RANGES.T, jnp.float32)))
+
+
+def _table_state(description: dict[str, Any]) -> TableState:
+    """Return what a half of OGBench's description of a task says."""
+    fixtures = np.array([0.0, 0.0, description["drawer_pos"], description["window_pos"]])
+    buttons = np.array(description["button_states"], np.int32)
+    return TableState(np.array(description["block_xyzs"], np.float64), fixtures, buttons)

@@ -16,8 +16,7 @@ SLIDES = ("drawer_slide", "window_slide")
 _PRESSED = -0.02  # m, how deep a button is when it flips
 _LOCKED, _FREE = 1e6, 2.0  # damping, in N s/m
 _BUTTON_SCALE, _DRAWER_SCALE, _WINDOW_SCALE = 120.0, 18.0, 15.0
-_BOUNDS = np.array([[0.05, -0.55, -0.18], [0.8, 0.55, 0.55]])  # m, where a cube was shot out by an instability
-_PUT_BACK = np.array([[0.3, -0.07], [0.45, 0.18]])  # m, lowest and highest (x, y) of where it is put then
+_BOUNDS = np.array([[0.05, -0.55, -0.18], [0.8, 0.55, 0.55]])  # m, beyond which a cube was shot out by an instability
 
 
 class SceneRig(ManipSpaceRig):
@@ -36,6 +35,7 @@ class SceneRig(ManipSpaceRig):
     def __init__(self, space: ManipSpace) -> None:
         super().__init__(space)
         self.sensed_size += 12
+        self._object_bounds = space.object_bounds
         model = space.stepped
         self._buttons = [int(model.joint(name).qposadr[0]) for name in BUTTONS]
         self._button_speeds = [int(model.joint(name).dofadr[0]) for name in BUTTONS]
@@ -70,7 +70,14 @@ class SceneRig(ManipSpaceRig):
         for sim in np.flatnonzero(out):
             rng = np.random.default_rng(np.frombuffer(batch.state[sim].tobytes(), np.uint32))
             half = rng.uniform(0, np.pi)
-            qpos[sim, first : first + 7] = (*rng.uniform(*_PUT_BACK), 0.02, np.cos(half), 0.0, 0.0, np.sin(half))
+            qpos[sim, first : first + 7] = (
+                *rng.uniform(*self._object_bounds),
+                0.02,
+                np.cos(half),
+                0.0,
+                0.0,
+                np.sin(half),
+            )
             batch.bind("qvel")[sim, self._cube_speeds] = 0.0
 
     def _objects(self, qpos: np.ndarray, qvel: np.ndarray, extra: np.ndarray) -> list[np.ndarray]:

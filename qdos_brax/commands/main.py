@@ -12,7 +12,7 @@ from qdos_brax import __version__
 from qdos_brax.commands.arguments import Parser, guarded, natural, parse, positive
 from qdos_brax.commands.config import add_parser as add_config
 from qdos_brax.commands.streams import lasting_streams
-from qdos_brax.commands.train import train_main
+from qdos_brax.commands.train import add_options, train_main
 from qdos_brax.errors import UserError
 
 _PROGRAM = "python -m qdos_brax"
@@ -28,15 +28,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return guarded(lambda: args.run(args))
 
 
-def main_parser(argv: Sequence[str]) -> Parser:
+def main_parser(argv: Sequence[str], prog: str = _PROGRAM) -> Parser:
     """Return the parser of ``python -m qdos_brax``; the actions of ``data`` only if ``argv`` asks for them."""
-    parser = Parser(
-        prog=_PROGRAM, description="Training, data, evaluation, reports, pictures, a check of this machine."
-    )
+    parser = Parser(prog=prog, description="Training, data, evaluation, reports, pictures, a check of this machine.")
     parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    commands.add_parser("train", help="train, as train.py does")
-    if argv[:1] == ["data"]:
+    add_options(commands.add_parser("train", help="train, as train.py does"))
+    if argv[:1] in (["data"], ["completion"]):
         from qdos_brax.commands.data import add_parser  # imports jax and h5py, which the others need not wait for
 
         add_parser(commands)
@@ -85,6 +83,10 @@ def main_parser(argv: Sequence[str]) -> Parser:
 
     doctor = commands.add_parser("doctor", help="check versions, devices, caches and callbacks of this machine")
     doctor.set_defaults(run=_doctor)
+
+    completion = commands.add_parser("completion", help="print a script by which a shell completes the command qdos")
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    completion.set_defaults(run=_completion)
     return parser
 
 
@@ -181,6 +183,15 @@ def _tasks(args: argparse.Namespace) -> int:
         )
         print("  ".join(cells).rstrip())
     print("\nmjx-warp runs on CUDA only. Run `python -m qdos_brax doctor` to see which engines work here.")
+    return 0
+
+
+def _completion(args: argparse.Namespace) -> int:
+    try:
+        import shtab
+    except ImportError as error:
+        raise UserError('completion needs shtab; run: pip install -c constraints.txt -e ".[completion]"') from error
+    print(shtab.complete(main_parser(["completion"], prog="qdos"), args.shell))
     return 0
 
 

@@ -47,13 +47,18 @@ def train_parser(prog: str = "python train.py") -> Parser:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    add_options(parser)
+    parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
+    return parser
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of ``train.py``, in groups."""
     _add_run(parser.add_argument_group("what is trained"))
     _add_sizes(parser.add_argument_group("how much, and with what settings"))
     _add_scan(parser.add_argument_group("scans: several values of --seed, --method or --set"))
     _add_folder(parser.add_argument_group("the run's folder"))
     _add_processes(parser.add_argument_group("several processes"))
-    parser.add_argument("--version", action="version", version=f"qdos-brax {__version__}")
-    return parser
 
 
 def _add_run(group: Any) -> None:

@@ -14,8 +14,9 @@ import numpy as np
 import PIL.Image
 import pytest
 
+import envs
 from envs import render
-from qdos_brax.analysis import film, strip
+from qdos_brax.analysis import film, pictures, strip
 from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.commands import main as commands
 from qdos_brax.errors import UserError
@@ -102,6 +103,25 @@ def test_a_small_film_is_what_was_drawn() -> None:
             image.seek(i)
             np.testing.assert_allclose(np.asarray(image.convert("RGB")), level, atol=4)
             assert image.info["duration"] == 100
+
+
+@pytest.mark.usefixtures("opengl")
+def test_an_episode_in_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 201 states, 20 s: eighty frames that play for 8 s, six of which are pictures; the camera goes along."""
+    monkeypatch.setattr(pictures, "_HEIGHT", 48)
+    monkeypatch.setattr(pictures, "_WIDTH", 64)
+    env = envs.make("antmaze-medium", physics="mujoco")
+    qpos = np.tile(np.asarray(env.engine.model.qpos0), (201, 1))
+    qpos[:, 0] = np.linspace(0, 4, 201)  # along the first corridor
+    found = pictures.draw_episode(env, qpos, np.tile(np.asarray(env.goal_xy), (201, 1)))
+    assert found["film_speed"] == pytest.approx(2.5)
+    assert found["frame_steps"][0] == 0 and found["frame_steps"][-1] == 200 and len(found["frame_steps"]) == 6
+    with PIL.Image.open(io.BytesIO(found["film"].tobytes())) as film:
+        assert film.n_frames == 80 and film.size == (64, 48)
+    for frame in found["frames"].astype(int):  # the ant's brown in the middle
+        assert frame[24, 32, 0] > 130 and frame[24, 32, 0] > frame[24, 32, 2] + 50
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    assert pictures.draw_episode(env, qpos, qpos) == {}
 
 
 def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:

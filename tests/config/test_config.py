@@ -25,7 +25,7 @@ def test_every_family_loads_with_every_preset(family: str, preset: str, tmp_path
     assert hash(config) == hash(configs.from_yaml(path))
 
 
-@pytest.mark.parametrize("name", [*envs.ALIASES, *dict.fromkeys(spec.name for spec in envs.list_tasks())])
+@pytest.mark.parametrize("name", dict.fromkeys([*envs.ALIASES, *(spec.name for spec in envs.list_tasks())]))
 def test_every_task_takes_the_layers_of_its_family(name: str) -> None:
     family = envs.get_spec(name).family
     layers = configs.run_layers(name, "paper")
