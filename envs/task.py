@@ -169,7 +169,7 @@ class Task(Env, ABC):
             key: what the physics' chances, and ``AutoReset`` for the next episode, draw from; None takes a fixed one.
             extra: int[e], the discrete state; None takes zeros.
         """
-        pipeline_state = self.engine.init(qpos, qvel, extra, key)
+        pipeline_state = self.start_physics(qpos, qvel, extra, key)
         obs = self.observe(pipeline_state)
         info = {
             "goal": jnp.asarray(self._goal if goal is None else goal, jnp.float32),
@@ -178,6 +178,12 @@ class Task(Env, ABC):
             "reset_key": jax.random.key(0) if key is None else key,
         }
         return State(pipeline_state, obs, jnp.zeros(()), jnp.zeros(()), {"success": jnp.zeros(())}, info)
+
+    def start_physics(
+        self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None, key: jax.Array | None
+    ) -> PipelineState:
+        """Return the physics of ``reset_to``; tasks whose sensors err draw the errors from ``key``."""
+        return self.engine.init(qpos, qvel, extra)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Return the state after one control step under ``action[act]`` in [-1, 1]."""

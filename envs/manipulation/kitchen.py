@@ -77,6 +77,12 @@ class Kitchen(Task):
         state = super().reset_to(qpos, qvel, goal, key, extra)
         return state.replace(metrics=state.metrics | {"score": jnp.zeros(())})
 
+    def start_physics(
+        self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None, key: jax.Array | None
+    ) -> PipelineState:
+        """Return the physics at (qpos[30], qvel[29], extra[7]), sensed with errors drawn from ``key``."""
+        return self.engine.init(qpos, qvel, extra, key)
+
     def step(self, state: State, action: jax.Array) -> State:
         """Return the state after one control step under ``action[9]``, over if all four are complete in it."""
         after = super().step(state, action)
