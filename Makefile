@@ -26,9 +26,9 @@ ci:
 	.ci/run
 
 docs:
-	$(PYTHON) tools/configuration_page.py
-	$(PYTHON) tools/concept_pictures.py
+	$(PYTHON) docs/tools/configuration_page.py
+	$(PYTHON) docs/tools/concept_pictures.py
 	$(PYTHON) -m mkdocs build --strict
 
 dist:
-	tools/release_check.sh
+	.ci/release_check

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 import yaml
 
+from docs.tools import concept_pictures, configuration_page
 from qdos_brax.commands.main import main_parser
 from qdos_brax.commands.train import configs_from_args, train_parser
 from qdos_brax.config import load_config
 from qdos_brax.config.methods import METHODS
-from tools import concept_pictures, configuration_page
 
 pytestmark = pytest.mark.quick
 
@@ -70,13 +70,13 @@ def test_pages_of_the_site_link_only_to_what_it_holds() -> None:
 
 
 def test_the_page_of_the_configuration_is_that_of_the_schema() -> None:
-    """Else: python tools/configuration_page.py."""
+    """Else: python docs/tools/configuration_page.py."""
     assert (DOCS / "configuration.md").read_text(encoding="utf-8") == configuration_page.page()
 
 
 @pytest.mark.parametrize("name", concept_pictures.PICTURES)
 def test_the_pictures_of_the_concepts_are_those_of_their_script(name: str) -> None:
-    """Else: python tools/concept_pictures.py."""
+    """Else: python docs/tools/concept_pictures.py."""
     assert (DOCS / name).read_text(encoding="utf-8") == concept_pictures.PICTURES[name]()
 
 

@@ -20,9 +20,9 @@ from qdos_brax.commands.main import main, main_parser
 from qdos_brax.commands.train import train_parser
 
 ROOT = Path(__file__).parents[1]
-EXAMPLE = ROOT / "examples" / "own_environment.py"
+EXAMPLE = ROOT / "docs" / "examples" / "own_environment.py"
 PAGE = (ROOT / "docs" / "own-environment.md").read_text(encoding="utf-8")
-START = "python examples/own_environment.py "
+START = "python docs/examples/own_environment.py "
 COMMANDS = [line.removeprefix(START) for line in PAGE.splitlines() if line.startswith(START)]
 
 

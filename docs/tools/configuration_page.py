@@ -1,4 +1,4 @@
-"""Write docs/configuration.md from the schema of the configuration: ``python tools/configuration_page.py``."""
+"""Write docs/configuration.md from the schema of the configuration: ``python docs/tools/configuration_page.py``."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from qdos_brax.commands.config import accepted, written
 from qdos_brax.config.schema import Config, get_field, groups, leaves
 from qdos_brax.files import write_text
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "configuration.md"
+PAGE = Path(__file__).resolve().parents[1] / "configuration.md"
 HEAD = """# Configuration
 
-Every key of a run's `config.yaml`, with its default. This page is written by `python tools/configuration_page.py`
+Every key of a run's `config.yaml`, with its default. This page is written by `python docs/tools/configuration_page.py`
 from the schema (`qdos_brax/config/`); a test keeps it up to date.
 
 A value comes from the highest layer that sets it, from below: the default here (the paper's), the task family's YAML

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/concepts.md, which lie beside it: ``python tools/concept_pictures.py``."""
+"""Draw the pictures of docs/concepts.md, which lie beside it: ``python docs/tools/concept_pictures.py``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from qdos_brax.files import write_text
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = Path(__file__).resolve().parents[1]
 LINE, INK, SOFT = 20, "#1b1f24", "#5b6470"
 OFFLINE, ONLINE, DATA = "#e3eef7", "#e2f3ec", "#f5f0e3"
 

@@ -1,8 +1,8 @@
 """An environment of your own, from the model to a trained agent; docs/own-environment.md goes through it.
 
-python examples/own_environment.py collect reacher.hdf5
-python examples/own_environment.py data check reacher.hdf5 --env reacher --horizon 10
-python examples/own_environment.py train --env reacher --dataset reacher.hdf5 --preset cpu
+python docs/examples/own_environment.py collect reacher.hdf5
+python docs/examples/own_environment.py data check reacher.hdf5 --env reacher --horizon 10
+python docs/examples/own_environment.py train --env reacher --dataset reacher.hdf5 --preset cpu
 """
 
 from __future__ import annotations
