@@ -10,7 +10,7 @@ import numpy as np
 from envs.manipulation.kitchen import Kitchen
 from envs.manipulation.kitchen_rig import JOINTS, START_QPOS, SUBTASKS
 from qdos_brax.collection.scripted.demonstrator import SimStates
-from qdos_brax.collection.scripted.kitchen_arm import Arm, Poses, Target
+from qdos_brax.collection.scripted.kitchen_arm import Arm, HandTarget, Poses
 from qdos_brax.collection.scripted.kitchen_skills import DOWN, FORWARD, SKILLS, Look, Targets, beside, move, pause
 from qdos_brax.data.quality import QUALITY
 
@@ -65,7 +65,7 @@ class KitchenDemonstrator:
         actions += noise[:, None] * rng.standard_normal((len(actions), JOINTS))
         return np.clip(actions, -1.0, 1.0).astype(np.float32), self._kinds.copy()
 
-    def _play(self, look: Look, kind: int) -> Iterator[Target]:
+    def _play(self, look: Look, kind: int) -> Iterator[HandTarget]:
         """Return the targets of an episode, which never end."""
         if kind == QUALITY["wander"]:
             return _wander(look)

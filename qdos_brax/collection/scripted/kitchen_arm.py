@@ -26,7 +26,7 @@ _SECONDS = 0.08  # of a control step
 _SPEED = 2.0  # rad/s of an action of 1
 
 
-class Target(NamedTuple):
+class HandTarget(NamedTuple):
     """Hold what one hand shall do in a control step.
 
     Attributes:
@@ -111,7 +111,7 @@ class Arm:
         self._low = np.maximum(model.jnt_range[:JOINTS, 0], bounds[:, 0]) + _MARGIN
         self._high = np.minimum(model.jnt_range[:JOINTS, 1], bounds[:, 1]) - _MARGIN
 
-    def actions(self, poses: Poses, targets: Sequence[Target]) -> np.ndarray:
+    def actions(self, poses: Poses, targets: Sequence[HandTarget]) -> np.ndarray:
         """Return float64[n, 9] in [-1, 1], which move the hands towards ``targets[n]``."""
         positions, rotations, grips, speeds = (np.array(part) for part in zip(*targets, strict=True))
         error = np.concatenate(

@@ -12,13 +12,13 @@ import mujoco
 import numpy as np
 
 from envs.manipulation.kitchen_rig import GOALS, SUBTASKS
-from qdos_brax.collection.scripted.kitchen_arm import Poses, Target, frame
+from qdos_brax.collection.scripted.kitchen_arm import HandTarget, Poses, frame
 
 FORWARD = frame([0, 1, 0], [1, 0, 0])
 DOWN = frame([0, 0.6, -0.8], [1, 0, 0])
 _ASKEW = frame([0.5, 0.86, 0], [0.86, -0.5, 0])
 
-Targets = Iterator[Target]
+Targets = Iterator[HandTarget]
 Place = np.ndarray | Callable[[], np.ndarray]
 
 
@@ -97,7 +97,7 @@ def move(
         position = place() if callable(place) else place
         if until() or (within and np.linalg.norm(position - look.tip) < within):
             return
-        yield Target(position, rotation() if callable(rotation) else rotation, grip, speed * look.pace)
+        yield HandTarget(position, rotation() if callable(rotation) else rotation, grip, speed * look.pace)
 
 
 def beside(place: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
@@ -107,7 +107,7 @@ def beside(place: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
 
 def pause(look: Look, steps: int, grip: bool) -> Targets:
     """Yield the hand's own place for ``steps``."""
-    target = Target(look.tip.copy(), look.hand.copy(), grip, 0.02)
+    target = HandTarget(look.tip.copy(), look.hand.copy(), grip, 0.02)
     for _ in range(steps):
         yield target
 
