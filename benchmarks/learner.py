@@ -206,8 +206,8 @@ def our_sac(width: int) -> Calls:
     def update(state: Any, key: jax.Array) -> Any:
         critic_key, batch_key, actor_key = jax.random.split(key, 3)
         state, _ = jax.lax.scan(critic_step, state, jax.random.split(critic_key, UTD))
-        seen = replay_buffer.sample(replay, batch_key, BATCH).observation
-        return sac.update_actor(state, seen, actor_key, hyper)[0]
+        batch = replay_buffer.sample(replay, batch_key, BATCH)
+        return sac.update_actor(state, batch, actor_key, hyper)[0]
 
     run = jax.jit(update, donate_argnums=0)
     held = [sac.init(jax.random.key(0), 1.0), 0]

@@ -64,15 +64,15 @@ class Skills:
         action = agent.low_level.first(agent.skills, key, normal, agent.box)
         skill = agent.skill(action, normal)
 
-        def step(carry: Any, _: None) -> tuple[Any, None]:
+        def step(carry: Any, index: jax.Array) -> tuple[Any, None]:
             state, success, steps = carry
-            new = env.step(state, agent.play(state.obs, skill))
+            new = env.step(state, agent.play(state.obs, skill, index))
             state = jax.tree.map(lambda a, b: jnp.where(success, a, b), state, new)
             steps = steps + ~success
             return (state, success | env.success(state.pipeline_state.qpos, state.info["goal"]), steps), None
 
         first = (start, env.success(qpos, start.info["goal"]), jnp.zeros((), jnp.int32))
-        (state, success, steps), _ = jax.lax.scan(step, first, None, self._horizon)
+        (state, success, steps), _ = jax.lax.scan(step, first, jnp.arange(self._horizon))
         physics = state.pipeline_state
         latent = skill[: agent.low_level.width]
         return {"success": success, "qpos": physics.qpos, "qvel": physics.qvel, "steps": steps, "latent": latent}

@@ -68,12 +68,13 @@ class EpisodeRunner:
         while not state.done:
             if length % self._trained.config.skills.horizon == 0:
                 decision = self._choose(*learned, state.obs)
-            state = self._step(*learned, state, decision)
+            state = self._step(*learned, state, decision, length % self._trained.config.skills.horizon)
             length += 1
             yield state, decision
 
-    def _step_once(self, artifacts: Any, hyper: Any, state: Any, decision: jax.Array) -> Any:
-        return self._trained.env.step(state, self._trained.agent(artifacts, hyper).play(state.obs, decision))
+    def _step_once(self, artifacts: Any, hyper: Any, state: Any, decision: jax.Array, step: jax.Array) -> Any:
+        action = self._trained.agent(artifacts, hyper).play(state.obs, decision, step)
+        return self._trained.env.step(state, action)
 
 
 def on_mujoco_c(trained: TrainedRun) -> TrainedRun:

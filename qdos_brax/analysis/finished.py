@@ -19,7 +19,7 @@ from qdos_brax.data.device import Normaliser
 from qdos_brax.errors import UserError
 from qdos_brax.high_level.agent import Agent, Policy
 from qdos_brax.high_level.evaluation import evaluate
-from qdos_brax.high_level.sac import SAC
+from qdos_brax.methods.actor_critics import make_actor_critic
 from qdos_brax.methods.build import make_policy
 from qdos_brax.methods.low_level_kinds import make_low_level
 from qdos_brax.offline.flat_policy import FlatPolicy
@@ -85,7 +85,7 @@ def _decide(trained: TrainedRun) -> jax.Array:
     """Return the first member's action at a blank observation."""
     artifacts, hyper = jax.tree.map(lambda leaf: leaf[0], (trained.artifacts, trained.hyper))
     agent, observation = trained.agent(artifacts, hyper), jnp.zeros(trained.env.observation_size)
-    return agent.play(observation, agent.choose(observation))
+    return agent.play(observation, agent.choose(observation), 0)
 
 
 def trained_run(config: Config, env: Any, artifacts: Any) -> TrainedRun:
@@ -111,11 +111,11 @@ def _policy(config: Config, env: Any) -> Callable[[Any, Any], Policy]:
     if policy is not None:
         act = make_policy(config, env, policy).act
         return lambda artifacts, hyper: FlatPolicy(Normaliser(**artifacts["normaliser"]), act, artifacts["policy"])
-    sac = SAC(env.observation_size, low_level.width, config.high_level)
+    high_level = make_actor_critic(config, env)
     return lambda artifacts, hyper: Agent(
         normaliser=Normaliser(**artifacts["normaliser"]),
         low_level=low_level,
-        sac=sac,
+        high_level=high_level,
         box=hyper["skills.latent_box"],
         skills=artifacts.get("skills", {}),
         actor=artifacts["actor"],

@@ -186,7 +186,7 @@ class _LatentView:
         def step(carry: tuple[Any, jax.Array], t: jax.Array) -> tuple[Any, jax.Array]:
             state, skill = carry
             skill = jnp.where(t % horizon == 0, agent.begin(state.obs, latent), skill)
-            state = env.step(state, agent.play(state.obs, skill))
+            state = env.step(state, agent.play(state.obs, skill, t % horizon))
             return (state, skill), _place_of_body(env, state.pipeline_state.qpos)
 
         start = env.reset(evaluation_key())

@@ -13,7 +13,7 @@ programs, each with a Config of its own (``load_programs``).
 
 from __future__ import annotations
 
-from qdos_brax.config.baseline_groups import DiveOffConfig, GuideConfig, HilbertConfig, PolicyConfig
+from qdos_brax.config.baseline_groups import DiveOffConfig, FlowConfig, GuideConfig, HilbertConfig, PolicyConfig
 from qdos_brax.config.layers import Layer, default_preset, families, family_layers, presets, run_layers
 from qdos_brax.config.load import (
     check_method,
@@ -39,6 +39,7 @@ __all__ = [
     "DataConfig",
     "DiveOffConfig",
     "EvalConfig",
+    "FlowConfig",
     "GuideConfig",
     "HighLevelConfig",
     "HilbertConfig",

@@ -1,10 +1,10 @@
-"""Configuration of the parts that only the other methods use: flat policies, the guide, HILP and DiveOff."""
+"""Configuration of the parts that only the other methods use: flat policies, the guide, flows, HILP and DiveOff."""
 
 from __future__ import annotations
 
 import dataclasses
 
-from qdos_brax.config.rules import count, number, rate, widths
+from qdos_brax.config.rules import choice, count, number, rate, widths
 from qdos_brax.config.skill_groups import Scannable
 
 
@@ -76,3 +76,17 @@ class DiveOffConfig:
         10_000, "first gradient steps, without weights and without the information term", low=0
     )
     updates: int = count(1_000_000, "gradient steps", pretrain=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class FlowConfig:
+    """Configure flow policies and what is learned offline before it goes on online (QC, FQL, WSRL, DSRL)."""
+
+    hidden: tuple[int, ...] = widths((512, 512, 512, 512), "hidden layers of the velocity field and one-step policy")
+    steps: int = count(10, "steps of Euler's method from noise to actions")
+    candidates: int = count(32, "(qc) proposals among which the critics choose")
+    target: str = choice("mean", "what the critics' heads make of a value: mean or min", "mean", "min")
+    distillation: Scannable = number(10.0, "(fql) weight alpha of the distance between the one-step and flow policies")
+    batch_size: int = count(256, "transitions per gradient step offline")
+    learning_rate: Scannable = rate(3e-4, "(dsrl) Adam learning rate of the cloned flow")
+    updates: int = count(1_000_000, "gradient steps offline", pretrain=True)

@@ -127,6 +127,10 @@ def check_method(config: Config) -> None:
             f"{config.method} has no skills, it decides at every step: skills.horizon must stay 1, not {horizon}"
         )
     high = config.high_level
+    if method.actor_critic != "sac" and high.regulariser != "entropy":
+        raise UserError(
+            f"{config.method} holds its actor near the data by itself: high_level.regulariser must stay entropy"
+        )
     if high.utd % high.actor_updates:
         raise UserError(
             f"high_level.utd ({high.utd}) must be a multiple of high_level.actor_updates ({high.actor_updates}): the "
@@ -142,20 +146,22 @@ _AS_BEFORE = {
     ("labels", "latent"): "sample",
     ("labels", "inputs"): "normalised",
 }
+_GROUPS_AS_BEFORE = ("scan", "flow")  # left out if they have their defaults
 
 
 def config_hash(config: Config) -> str:
     """Return 16 hex digits over everything that decides the result, which neither folders nor the ``run`` group do.
 
-    Values without effect are left out too, so that runs from before such a key existed can be read: the scan group if
-    it has its defaults, the keys of ``_AS_BEFORE`` at the values that say what was done before there was a choice, and
-    the members per program if there is one member or no number was given.
+    Values without effect are left out too, so that runs from before such a key existed can be read: the groups of
+    ``_GROUPS_AS_BEFORE`` if they have their defaults, the keys of ``_AS_BEFORE`` at the values that say what was done
+    before there was a choice, and the members per program if there is one member or no number was given.
     """
     content = plain(config)
     for key in ("out", "dataset", "skills_file", "run"):
         del content[key]
-    if config.scan == Config().scan:
-        del content["scan"]
+    for group in _GROUPS_AS_BEFORE:
+        if getattr(config, group) == getattr(Config(), group):
+            del content[group]
     for (group, key), value in _AS_BEFORE.items():
         if content[group][key] == value:
             del content[group][key]

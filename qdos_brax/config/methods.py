@@ -19,12 +19,16 @@ class Method:
     Attributes:
         summary: one line for a list of methods.
         low_level: kind of low-level policy: "trajectory" (a VAE of segments), "transition" (a VAE of single
-            transitions), "direction" (conditioned on directions in a Hilbert representation) or "action" (none: the
-            policy chooses actions itself).
+            transitions), "direction" (conditioned on directions in a Hilbert representation), "noise" (chunks of
+            actions that a flow makes of noise), "chunk" (none: the policy chooses chunks of actions) or "action" (none:
+            it chooses actions itself).
         weighted: whether segments are weighted by their advantage; otherwise all count the same, and no values are
             learned.
         information: whether the mutual-information term is on.
         guide: the policy that acts in the first steps of an episode online, "diffusion", or None.
+        actor_critic: what decides and learns online: "sac", "best-of-n" (of a flow's proposals) or "distilled-flow" (a
+            one-step policy near a flow's).
+        offline: how it is learned from the data before it goes on online: "own" (by its own losses), "cal-ql" or None.
         policy: the flat policy that is learned from the data alone, "bc" or "iql", with no online learning; or None.
         settings: published values by dotted key.
         by_family: published values of single task families.
@@ -35,6 +39,8 @@ class Method:
     weighted: bool = False
     information: bool = False
     guide: str | None = None
+    actor_critic: str = "sac"
+    offline: str | None = None
     policy: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     by_family: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -61,6 +67,26 @@ _FLAT = {"skills.horizon": 1}
 _OFFLINE_WIDTHS = {
     family: {"policy.hidden": [512, 512, 512], "values.hidden": [512, 512, 512]}
     for family in ("antsoccer", "cube", "humanoidmaze", "scene")
+}
+
+# Li, Zhou, Levine 2025, "Reinforcement learning with action chunking" (arXiv 2507.07969, table of hyperparameters and
+# code ColinQiyangLi/qc): chunks of 5 actions, 4 layers of 512, 2 critics, a step of everything per environment step
+# (5 per chunk), none in the first 5,000, in which the offline policy acts.
+_CONTINUED = {
+    "high_level.hidden": [512, 512, 512, 512],
+    "high_level.ensemble": 2,
+    "labels.rnd_coefficient": 0.0,
+}
+_CHUNKS = _CONTINUED | {"skills.horizon": 5, "high_level.utd": 5, "high_level.actor_updates": 5}
+
+# Park, Li, Levine 2025, "Flow Q-learning" (arXiv 2502.02538, table and the commands of seohongpark/fql): alpha by task,
+# the minimum of the critics on ant mazes, discount 0.995 where it is said.
+_FQL: dict[str, dict[str, Any]] = {
+    "antmaze": {"flow.distillation": 10.0, "flow.target": "min"},
+    "antsoccer": {"flow.distillation": 10.0, "high_level.discount": 0.995},
+    "humanoidmaze": {"flow.distillation": 30.0, "high_level.discount": 0.995},
+    "cube": {"flow.distillation": 300.0},
+    "scene": {"flow.distillation": 300.0},
 }
 
 METHODS = {
@@ -129,6 +155,43 @@ METHODS = {
         policy="bc",
         settings=_FLAT,
         by_family=_OFFLINE_WIDTHS,
+    ),
+    # The publication has no ant mazes, no soccer and no humanoids: its values, with FQL's discounts and targets.
+    "qc": Method(
+        "chunks of actions: the best of N that a flow clone of the data proposes (Q-chunking, Li et al. 2025)",
+        low_level="chunk",
+        actor_critic="best-of-n",
+        offline="own",
+        settings=_CHUNKS,
+        by_family={
+            family: {key: value for key, value in values.items() if key != "flow.distillation"}
+            for family, values in _FQL.items()
+        },
+    ),
+    # alpha 100 is the publication's on cube-triple.
+    "qc-fql": Method(
+        "chunks of actions by flow Q-learning (QC-FQL, Li et al. 2025)",
+        low_level="chunk",
+        actor_critic="distilled-flow",
+        offline="own",
+        settings=_CHUNKS | {"flow.distillation": 100.0},
+        by_family=_FQL | {"cube": {"flow.distillation": 100.0}, "scene": {"flow.distillation": 100.0}},
+    ),
+    "fql": Method(
+        "a one-step policy near a flow clone of the data, offline and on online (FQL, Park et al. 2025)",
+        low_level="action",
+        actor_critic="distilled-flow",
+        offline="own",
+        settings=_FLAT | _CONTINUED | {"high_level.utd": 1},
+        by_family=_FQL,
+    ),
+    # Wagenmaker et al. 2025, "Steering your diffusion policy with latent space reinforcement learning" (arXiv
+    # 2506.15799; code ajwagen/dsrl): SAC on noise that a box bounds, without the data (their DSRL-SAC; DSRL-NA has a
+    # second critic, on actions). Chunks of 4 actions, as their policies for robomimic and gym have.
+    "dsrl": Method(
+        "SAC over the noise of a frozen flow clone of the data (DSRL, Wagenmaker et al. 2025)",
+        low_level="noise",
+        settings={"skills.horizon": 4, "labels.rnd_coefficient": 0.0, "high_level.offline_fraction": 0.0},
     ),
     # Osa and Harada 2024, "Discovering multiple solutions from a single task in offline reinforcement learning": z of
     # dimension 2 from [-2, 2], which the high level draws on as the paper does on its own skills.

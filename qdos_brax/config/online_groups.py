@@ -82,7 +82,10 @@ class HighLevelConfig:
     )
     num_envs: int = count(1, "environments stepped side by side")
     warmup_env_steps: int = count(
-        5_000, "first environment steps, in which the state prior acts instead of the actor", low=0
+        5_000,
+        "first environment steps, in which the state prior acts instead of the actor; where that was learned offline, "
+        "it acts, and does not learn yet",
+        low=0,
     )
     env_steps: int = count(200_000, "environment steps of the online phase, over all environments")
     replay_capacity: int = count(1_000_000, "most macro transitions kept; a run allocates no more than it will play")

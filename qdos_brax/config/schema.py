@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
-from qdos_brax.config.baseline_groups import DiveOffConfig, GuideConfig, HilbertConfig, PolicyConfig
+from qdos_brax.config.baseline_groups import DiveOffConfig, FlowConfig, GuideConfig, HilbertConfig, PolicyConfig
 from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig
 from qdos_brax.config.rules import Rule, choice, count, field
 from qdos_brax.config.run_groups import RunConfig, ScanConfig
@@ -49,6 +49,7 @@ class Config:
     guide: GuideConfig = GuideConfig()
     hilbert: HilbertConfig = HilbertConfig()
     diveoff: DiveOffConfig = DiveOffConfig()
+    flow: FlowConfig = FlowConfig()
     eval: EvalConfig = EvalConfig()
     scan: ScanConfig = ScanConfig()
     run: RunConfig = RunConfig()
@@ -81,7 +82,7 @@ def pretrain_keys() -> list[str]:
 
 def skill_keys(low_level: str) -> list[str]:
     """Return the dotted keys that say what skills are, for a kind of low-level policy (``methods.Method``)."""
-    groups = ("skills", *{"direction": ("hilbert",), "transition": ("diveoff",)}.get(low_level, ()))
+    groups = ("skills", *{"direction": ("hilbert",), "transition": ("diveoff",), "noise": ("flow",)}.get(low_level, ()))
     return [key for key, _ in leaves(Config) if key.partition(".")[0] in groups]
 
 

@@ -17,6 +17,7 @@ from qdos_brax.high_level import replay as replay_buffer
 from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
+from qdos_brax.high_level.warm_up import WarmUp
 
 NEVER = -1
 """``first_goal_step`` before the goal was reached."""
@@ -43,13 +44,14 @@ class ActingState(struct.PyTreeNode):
 
 
 class Acting:
-    """Play macro steps with one member's agent; the first ones with random skills, or by the guide.
+    """Play macro steps with one member's agent; the first ones by the warm-up, or by the guide.
 
     Args:
         config: the run's configuration.
         env: the task.
         normaliser: of observations.
         capacity: macro transitions that the replay holds.
+        warm_up: who acts in the first steps.
         guide: acts for an episode's first steps, or None; it acts step by step, so the horizon must be 1.
 
     Raises:
@@ -57,12 +59,18 @@ class Acting:
     """
 
     def __init__(
-        self, config: Config, env: Env, normaliser: Normaliser, capacity: int, guide: JumpStart | None
+        self,
+        config: Config,
+        env: Env,
+        normaliser: Normaliser,
+        capacity: int,
+        warm_up: WarmUp,
+        guide: JumpStart | None,
     ) -> None:
         if guide is not None and config.skills.horizon != 1:
             raise ValueError("a guide acts step by step: the horizon must be 1")
         self._num_envs, self._horizon = config.high_level.num_envs, config.skills.horizon
-        self._warmup, self._capacity = config.high_level.warmup_env_steps, capacity
+        self._warm_up, self._capacity = warm_up, capacity
         self._env, self._normalise, self._guide = env, normaliser, guide
 
     def start(self, key: jax.Array, example: Transition) -> ActingState:
@@ -89,8 +97,8 @@ class Acting:
         first_key, actor_key, reset_key = jax.random.split(key, 3)
         observation = self._normalise(state.env_state.obs)
         first = agent.low_level.first(agent.skills, first_key, observation, agent.box)
-        action = agent.sac.act(agent.actor, actor_key, observation)
-        action = jnp.where(state.env_steps < self._warmup, first, action)
+        action = agent.high_level.act(agent.actor, actor_key, observation)
+        action = self._warm_up.action(state.env_steps, first, action)
         if self._guide is not None:
             guided = self._guide.sample(guide_params, _guide_key(actor_key), observation)
             guided = agent.low_level.to_action(agent.skills, guided, observation, agent.box)
@@ -99,7 +107,8 @@ class Acting:
         discount = hyper["high_level.discount"]
 
         def one(env_state: State, skill: jax.Array) -> tuple[State, MacroStep]:
-            return macro_step(self._env, lambda obs: agent.play(obs, skill), env_state, self._horizon, discount)
+            play = lambda obs, step: agent.play(obs, skill, step)  # noqa: E731
+            return macro_step(self._env, play, env_state, self._horizon, discount)
 
         env_state, result = jax.vmap(one)(state.env_state, skill)
         rows = Transition(observation, action, result.reward, result.mask, self._normalise(result.next_observation))

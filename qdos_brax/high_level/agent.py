@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import jax
 
 from qdos_brax.data.device import Normaliser
-from qdos_brax.high_level.sac import SAC
+from qdos_brax.high_level.actor_critic import ActorCritic
 from qdos_brax.skills.low_level import LowLevelPolicy
 
 
@@ -19,8 +19,8 @@ class Policy(Protocol):
         """Return the decision at observation[obs], as the environment gives it."""
         ...
 
-    def play(self, observation: jax.Array, decision: jax.Array) -> jax.Array:
-        """Return the action[act] of a decision at an observation."""
+    def play(self, observation: jax.Array, decision: jax.Array, step: jax.Array | int) -> jax.Array:
+        """Return the action[act] of a decision at an observation, ``step`` steps after it was made."""
         ...
 
 
@@ -31,15 +31,15 @@ class Agent:
     Attributes:
         normaliser: of observations.
         low_level: what the high level's action does.
-        sac: the high level.
+        high_level: chooses that action.
         box: half the side of the box of latents.
         skills: parameters of the low-level policy.
-        actor: parameters of the high level's actor.
+        actor: parameters of what chooses it.
     """
 
     normaliser: Normaliser
     low_level: LowLevelPolicy
-    sac: SAC
+    high_level: ActorCritic
     box: jax.Array | float
     skills: Any
     actor: Any
@@ -50,7 +50,7 @@ class Agent:
         Its first ``low_level.width`` numbers are the latent z.
         """
         normal = self.normaliser(observation)
-        return self.skill(self.sac.mode(self.actor, normal), normal)
+        return self.skill(self.high_level.mode(self.actor, normal), normal)
 
     def skill(self, action: jax.Array, normal: jax.Array) -> jax.Array:
         """Return the skill[..., s] that u[..., width] plays from normal[..., obs] on, a normalised observation."""
@@ -61,6 +61,6 @@ class Agent:
         """Return the skill[..., s] of z[..., width] that is played from observation[..., obs] on."""
         return self.low_level.begin(self.skills, latent, self.normaliser(observation))
 
-    def play(self, observation: jax.Array, decision: jax.Array) -> jax.Array:
-        """Return the action[..., act] of a skill at an observation."""
-        return self.low_level.act(self.skills, self.normaliser(observation), decision)
+    def play(self, observation: jax.Array, decision: jax.Array, step: jax.Array | int) -> jax.Array:
+        """Return the action[..., act] of a skill at an observation, ``step`` steps after it began."""
+        return self.low_level.act(self.skills, self.normaliser(observation), decision, step)

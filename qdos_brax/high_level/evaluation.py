@@ -32,7 +32,7 @@ class Episodes(NamedTuple):
 def evaluate(
     env: Env,
     choose: Callable[[jax.Array], jax.Array],
-    play: Callable[[jax.Array, jax.Array], jax.Array],
+    play: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
     key: jax.Array,
     episodes: int,
     horizon: int,
@@ -42,7 +42,7 @@ def evaluate(
     Args:
         env: the task.
         choose: observation[obs] -> skill z[latent], asked every ``horizon`` steps.
-        play: (observation[obs], z[latent]) -> action.
+        play: (observation[obs], z[latent], steps since it was chosen) -> action.
         key: for the starts.
         episodes: how many.
         horizon: environment steps per decision.
@@ -50,7 +50,7 @@ def evaluate(
 
     def one(state: State) -> tuple[State, jax.Array, jax.Array, jax.Array]:
         latent = choose(state.obs)
-        state, result = macro_step(env, lambda observation: play(observation, latent), state, horizon, 1.0)
+        state, result = macro_step(env, lambda obs, step: play(obs, latent, step), state, horizon, 1.0)
         return state, result.success, result.episode_return, result.steps
 
     def going(carry: tuple[State, Episodes]) -> jax.Array:

@@ -13,16 +13,16 @@ from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.transitions import Transition, macro_transitions
 from qdos_brax.high_level import replay as replay_buffer
-from qdos_brax.high_level.sac import SAC, Reference, SACHyper, SACState
+from qdos_brax.high_level.actor_critic import ActorCritic, Reference
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
 from qdos_brax.skills.low_level import LowLevelPolicy
 
 
 class Learners(struct.PyTreeNode):
-    """Hold everything that learns online: SAC, the bonus for novelty, and the labeller of offline rewards."""
+    """Hold everything that learns online: the high level, the bonus for novelty, and the labeller of rewards."""
 
-    sac: SACState
+    high_level: Any
     bonus: Any
     labeller: Any
 
@@ -53,23 +53,28 @@ class Learning:
 
     Args:
         config: the run's configuration.
-        sac: the high level.
+        high_level: what decides.
         low_level: the frozen low-level policy.
         labeller: gives offline rows their reward and mask.
         bonus: for novelty.
     """
 
     def __init__(
-        self, config: Config, sac: SAC, low_level: LowLevelPolicy, labeller: OfflineReward, bonus: Bonus
+        self,
+        config: Config,
+        high_level: ActorCritic,
+        low_level: LowLevelPolicy,
+        labeller: OfflineReward,
+        bonus: Bonus,
     ) -> None:
-        self._high, self._labels, self._horizon = config.high_level, config.labels, config.skills.horizon
-        self._sac, self._low_level, self._labeller, self._bonus = sac, low_level, labeller, bonus
-        self._offline = round(self._high.batch_size * self._high.offline_fraction)
+        self._config, self._labels, self._horizon = config.high_level, config.labels, config.skills.horizon
+        self._high_level, self._low_level, self._labeller, self._bonus = high_level, low_level, labeller, bonus
+        self._offline = round(self._config.batch_size * self._config.offline_fraction)
 
-    def init(self, sac_key: jax.Array, bonus_key: jax.Array, labeller_key: jax.Array, hyper: Any) -> Learners:
+    def init(self, high_level_key: jax.Array, bonus_key: jax.Array, labeller_key: jax.Array, hyper: Any) -> Learners:
         """Return fresh learners."""
         return Learners(
-            sac=self._sac.init(sac_key, hyper["high_level.init_temperature"]),
+            high_level=self._high_level.start(high_level_key, hyper),
             bonus=self._bonus.init(bonus_key),
             labeller=self._labeller.init(labeller_key),
         )
@@ -94,14 +99,14 @@ class Learning:
         bonus = self._bonus.learn(learners.bonus, newest.observation[None], newest.action[None], hyper, active)
         learners = learners.replace(bonus=bonus)
         learners = self._learn_rewards(learners, label_key, active, sources)
-        sac, info = self._learn_sac(learners, critic_key, actor_key, sources)
+        high_level, info = self._learn_high_level(learners, critic_key, actor_key, sources)
         earned = self._bonus.of(learners.bonus, newest.observation, newest.action, hyper)
-        return learners.replace(sac=sac), info | {"bonus": jnp.mean(earned)}
+        return learners.replace(high_level=high_level), info | {"bonus": jnp.mean(earned)}
 
     def sample(self, learners: Learners, key: jax.Array, sources: Sources) -> Transition:
         """Return a batch, offline rows first, with the bonus for novelty added to rewards."""
         online_key, offline_key = jax.random.split(key)
-        rows = replay_buffer.sample(sources.replay, online_key, self._high.batch_size - self._offline)
+        rows = replay_buffer.sample(sources.replay, online_key, self._config.batch_size - self._offline)
         if self._offline:
             offline = self._sample_offline(learners, offline_key, sources)
             rows = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), offline, rows)
@@ -120,53 +125,46 @@ class Learning:
 
     def _learn_rewards(self, learners: Learners, key: jax.Array, active: jax.Array, sources: Sources) -> Learners:
         """Make as many steps of the labeller as of the critics, on as many online rows (SUPE's, ExPLORe's code)."""
-        rate, online = sources.hyper["labels.reward_learning_rate"], self._high.batch_size - self._offline
+        rate, online = sources.hyper["labels.reward_learning_rate"], self._config.batch_size - self._offline
 
         def step(labeller: Any, key: jax.Array) -> tuple[Any, None]:
             rows = replay_buffer.sample(sources.replay, key, online)
             return self._labeller.learn(labeller, rows, rate, active), None
 
-        labeller, _ = jax.lax.scan(step, learners.labeller, jax.random.split(key, self._high.utd))
+        labeller, _ = jax.lax.scan(step, learners.labeller, jax.random.split(key, self._config.utd))
         return learners.replace(labeller=labeller)
 
-    def _learn_sac(
+    def _learn_high_level(
         self, learners: Learners, critic_key: jax.Array, actor_key: jax.Array, sources: Sources
-    ) -> tuple[SACState, dict[str, jax.Array]]:
-        """Make ``utd`` critic steps and ``actor_updates`` of actor and temperature, which take turns."""
-        hyper = sources.hyper
-        target_entropy, reference = self._regulariser(sources.skills, hyper)
-        sac_hyper = SACHyper(
-            learning_rate=hyper["high_level.learning_rate"],
-            discount=hyper["high_level.discount"],
-            target_rate=hyper["high_level.target_rate"],
-            target_entropy=target_entropy,
-        )
+    ) -> tuple[Any, dict[str, jax.Array]]:
+        """Make ``utd`` critic steps and ``actor_updates`` of the actor, which take turns."""
+        learner, hyper = self._high_level, self._high_level.hyper(sources.hyper)
+        reference = self._reference(sources.skills, sources.hyper)
         sample = partial(self.sample, learners, sources=sources)
 
-        def critic_step(sac: SACState, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
+        def critic_step(state: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
             batch_key, update_key = jax.random.split(key)
-            return self._sac.update_critic(sac, sample(batch_key), update_key, sac_hyper, reference)
+            return learner.update_critic(state, sample(batch_key), update_key, hyper, reference)
 
-        def turn(sac: SACState, keys: tuple[jax.Array, jax.Array]) -> tuple[SACState, dict[str, jax.Array]]:
+        def turn(state: Any, keys: tuple[jax.Array, jax.Array]) -> tuple[Any, dict[str, jax.Array]]:
             critic_keys, actor_key = keys
-            sac, critic_info = jax.lax.scan(critic_step, sac, critic_keys)
+            state, critic_info = jax.lax.scan(critic_step, state, critic_keys)
             batch_key, update_key = jax.random.split(actor_key)
-            observation = sample(batch_key).observation
-            sac, actor_info = self._sac.update_actor(sac, observation, update_key, sac_hyper, reference)
-            return sac, jax.tree.map(jnp.mean, critic_info) | actor_info
+            state, actor_info = learner.update_actor(state, sample(batch_key), update_key, hyper, reference)
+            return state, jax.tree.map(jnp.mean, critic_info) | actor_info
 
-        turns = self._high.actor_updates
-        critic_keys = jax.random.split(critic_key, self._high.utd).reshape(turns, -1)
+        turns = self._config.actor_updates
+        critic_keys = jax.random.split(critic_key, self._config.utd).reshape(turns, -1)
         actor_keys = actor_key[None] if turns == 1 else jax.random.split(actor_key, turns)
-        sac, info = jax.lax.scan(turn, learners.sac, (critic_keys, actor_keys))
-        return sac, jax.tree.map(jnp.mean, info)
+        state, info = jax.lax.scan(turn, learners.high_level, (critic_keys, actor_keys))
+        return state, jax.tree.map(jnp.mean, info)
 
-    def _regulariser(self, skills: Any, hyper: dict[str, jax.Array]) -> tuple[jax.Array, Reference | None]:
-        """Return the entropy that the temperature aims at, and the density it is relative to."""
-        if self._high.regulariser == "entropy":
-            return -hyper["high_level.target_entropy_scale"] * self._sac.action_dim, None
+    def _reference(self, skills: Any, hyper: dict[str, jax.Array]) -> Reference | None:
+        """Return the density that the actor is held against, the skill prior's or none."""
+        if self._config.regulariser == "entropy":
+            return None
 
         def log_prior(observation: jax.Array, action: jax.Array) -> jax.Array:
             return self._low_level.log_prior(skills, action, observation, hyper["skills.latent_box"])
 
-        return -hyper["high_level.target_divergence"], log_prior
+        return log_prior

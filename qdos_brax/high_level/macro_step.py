@@ -33,23 +33,28 @@ class MacroStep(NamedTuple):
 
 
 def macro_step(
-    env: Env, policy: Callable[[jax.Array], jax.Array], state: State, horizon: int, discount: jax.Array | float
+    env: Env,
+    policy: Callable[[jax.Array, jax.Array], jax.Array],
+    state: State,
+    horizon: int,
+    discount: jax.Array | float,
 ) -> tuple[State, MacroStep]:
-    """Play ``policy`` (observation -> action) for ``horizon`` steps of one environment, batched by ``jax.vmap``.
+    """Play ``policy`` for ``horizon`` steps of one environment, batched by ``jax.vmap``; it is a function of the
+    observation and of the number of steps before.
 
     An episode that ends early idles to the end of the macro step: its state stays, and only live steps count. The
     environment is not reset. A state that is done already gives a macro step of no live steps and reward 0.
     """
 
-    def step(carry: tuple[State, MacroStep], power: jax.Array) -> tuple[tuple[State, MacroStep], None]:
+    def step(carry: tuple[State, MacroStep], index: jax.Array) -> tuple[tuple[State, MacroStep], None]:
         state, result = carry
         alive = state.done < 0.5
-        new = env.step(state, policy(state.obs))
+        new = env.step(state, policy(state.obs, index))
         finite = jnp.all(jnp.isfinite(new.obs)) & jnp.isfinite(new.reward)
         terminated = (new.done > 0.5) & (new.info["truncation"] < 0.5)
         live = alive.astype(jnp.float32)
         result = MacroStep(
-            reward=result.reward + live * discount**power * new.reward,
+            reward=result.reward + live * discount**index * new.reward,
             mask=jnp.where(alive & terminated, 0.0, result.mask),
             next_observation=jnp.where(alive, new.info["final_obs"], result.next_observation),
             steps=result.steps + alive.astype(jnp.int32),

@@ -11,16 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env
 from flax import struct
+from flax.serialization import from_state_dict, to_state_dict
 
 from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.data.transitions import Transition
 from qdos_brax.high_level.acting import NEVER, Acting, ActingState, with_first_goal
+from qdos_brax.high_level.actor_critic import AGENT, ActorCritic
 from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.learning import Learners, Learning, Sources
-from qdos_brax.high_level.sac import SAC
+from qdos_brax.high_level.warm_up import WarmUp
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
 from qdos_brax.population import health
@@ -50,17 +52,19 @@ class OnlinePhaseState(struct.PyTreeNode):
 
 
 class OnlinePhase(MemberPhase):
-    """Run SAC over skills, or over actions where the low-level policy has no skills.
+    """Learn which skill to play, or which action where the low-level policy has no skills.
 
     Each iteration plays one macro step in every environment, stores them, and makes ``utd`` critic steps and
-    ``actor_updates`` of actor and temperature per macro step played. Of a batch, ``offline_fraction`` is labelled data,
-    the rest online experience.
+    ``actor_updates`` of the actor per macro step played. Of a batch, ``offline_fraction`` is labelled data, the rest
+    online experience.
 
     Args:
         config: the run's configuration.
         env: the task; the training environments and those of the evaluation are separate states of it.
         normaliser: of observations.
         low_level: the frozen skills.
+        high_level: what decides; it begins as an earlier phase left it under "agent", if one did.
+        warm_up: who acts in the first steps, and when learning begins.
         labeller: gives offline rows their reward and mask.
         bonus: for novelty.
         guide: acts for an episode's first steps, or None; it acts step by step, so the horizon must be 1.
@@ -73,6 +77,8 @@ class OnlinePhase(MemberPhase):
         env: Env,
         normaliser: Normaliser,
         low_level: LowLevelPolicy,
+        high_level: ActorCritic,
+        warm_up: WarmUp,
         labeller: OfflineReward,
         bonus: Bonus,
         guide: JumpStart | None = None,
@@ -86,15 +92,23 @@ class OnlinePhase(MemberPhase):
         self._evaluate_every = max(1, round(config.eval.every_env_steps / (self._iterations * per_iteration)))
         self._episodes, self._num_envs, self._utd = config.eval.episodes, high.num_envs, high.utd
         self._env, self._normalise, self._low_level = env, normaliser, low_level
-        self._sac = SAC(normaliser.mean.shape[-1], low_level.width, high)
+        self._high_level, self._warm_up = high_level, warm_up
         capacity = min(high.replay_capacity, self.num_chunks * self._iterations * high.num_envs)
-        self._acting = Acting(config, env, normaliser, capacity, guide)
-        self.learning = Learning(config, self._sac, low_level, labeller, bonus)
+        self._acting = Acting(config, env, normaliser, capacity, warm_up, guide)
+        self.learning = Learning(config, high_level, low_level, labeller, bonus)
 
     def bind(self, population: Population, data: DeviceData) -> None:
         """Compile the programs, that of the evaluation included."""
         super().bind(population, data)
         self._evaluate = population.program(self._play_episodes, carries=True)
+
+    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[Any, Any]:
+        """Return the first state, with the high level as it was learned offline if it was, and the constants."""
+        state, constants = super().init(key, artifacts)
+        fresh = state.learners.high_level
+        given = jax.tree.map(jnp.array, artifacts.get(AGENT, to_state_dict(fresh)))  # copies: states are donated
+        learners = state.learners.replace(high_level=from_state_dict(fresh, given))
+        return state.replace(learners=learners), constants
 
     def chunk(self, state: OnlinePhaseState, constants: Any) -> tuple[OnlinePhaseState, dict[str, Any]]:
         """Make some iterations, and an evaluation when one is due (always after the last chunk)."""
@@ -124,19 +138,20 @@ class OnlinePhase(MemberPhase):
         return {name: artifacts.get(name, {}) for name in ("skills", "labels", "guide")}
 
     def finish(self, state: OnlinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Return the artifacts with the actor and its normaliser; labels and the guide are dropped."""
-        kept = {name: value for name, value in artifacts.items() if name not in ("labels", "guide")}
+        """Return the artifacts with the actor and its normaliser; what served learning alone is dropped."""
+        kept = {name: value for name, value in artifacts.items() if name not in ("labels", "guide", AGENT)}
         normaliser = self._normalise.repeated(state.update.shape[0])
-        return kept | {"actor": state.learners.sac.actor, "normaliser": normaliser, health.KEY: state.healthy}
+        actor = self._high_level.actor_params(state.learners.high_level)
+        return kept | {"actor": actor, "normaliser": normaliser, health.KEY: state.healthy}
 
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> OnlinePhaseState:
         """Return fresh learners, an empty replay, environments at their starts."""
-        sac_key, bonus_key, labeller_key, env_key, key = jax.random.split(key, 5)
-        observation = jnp.zeros(self._sac.observation_dim)
-        row = Transition(observation, jnp.zeros(self._sac.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
+        high_level_key, bonus_key, labeller_key, env_key, key = jax.random.split(key, 5)
+        observation = jnp.zeros(self._high_level.observation_dim)
+        row = Transition(observation, jnp.zeros(self._high_level.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
         return OnlinePhaseState(
             key=key,
-            learners=self.learning.init(sac_key, bonus_key, labeller_key, hyper),
+            learners=self.learning.init(high_level_key, bonus_key, labeller_key, hyper),
             acting=self._acting.start(env_key, row),
             update=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),
@@ -157,7 +172,7 @@ class OnlinePhase(MemberPhase):
         self, state: OnlinePhaseState, _: None, constants: Any, hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[OnlinePhaseState, dict[str, jax.Array]]:
         act_key, update_key, key = jax.random.split(state.key, 3)
-        agent = self._agent(state.learners.sac.actor, constants["skills"], hyper)
+        agent = self._agent(state.learners, constants["skills"], hyper)
         acting, newest, info = self._acting.step(state.acting, act_key, agent, constants["guide"], hyper)
         sources = Sources(acting.replay, data, constants["skills"], constants["labels"], hyper)
         learn = partial(self.learning.step, env_steps=acting.env_steps, sources=sources)
@@ -165,7 +180,9 @@ class OnlinePhase(MemberPhase):
         learners, losses = jax.lax.scan(learn, state.learners, (keys, newest))
 
         learners, healthy = health.keep_finite(state.healthy, learners, state.learners)
-        update = state.update + self._num_envs * self._utd
+        learns = self._warm_up.learns(acting.env_steps)
+        learners = jax.tree.map(lambda new, old: jnp.where(learns, new, old), learners, state.learners)
+        update = state.update + jnp.where(learns, self._num_envs * self._utd, 0)
         state = state.replace(key=key, learners=learners, acting=acting, healthy=healthy, update=update)
         return state, info | jax.tree.map(jnp.mean, losses)
 
@@ -173,9 +190,10 @@ class OnlinePhase(MemberPhase):
         self, state: OnlinePhaseState, constants: Any, hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[OnlinePhaseState, Episodes]:
         key, episode_key = jax.random.split(state.key)
-        agent = self._agent(state.learners.sac.actor, constants["skills"], hyper)
+        agent = self._agent(state.learners, constants["skills"], hyper)
         episodes = evaluate(self._env, agent.choose, agent.play, episode_key, self._episodes, self._horizon)
         return state.replace(key=key, acting=with_first_goal(state.acting, episodes.success)), episodes
 
-    def _agent(self, actor: Any, skills: Any, hyper: dict[str, jax.Array]) -> Agent:
-        return Agent(self._normalise, self._low_level, self._sac, hyper["skills.latent_box"], skills, actor)
+    def _agent(self, learners: Learners, skills: Any, hyper: dict[str, jax.Array]) -> Agent:
+        actor, box = self._high_level.actor_params(learners.high_level), hyper["skills.latent_box"]
+        return Agent(self._normalise, self._low_level, self._high_level, box, skills, actor)

@@ -6,7 +6,6 @@ may be scanned is an argument, so that members of a population differ along a ``
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,12 +15,11 @@ from flax import struct
 
 from qdos_brax.config import HighLevelConfig
 from qdos_brax.data.transitions import Transition
+from qdos_brax.high_level.actor_critic import Reference
 from qdos_brax.nn.networks import DiagonalGaussian, Ensemble, tanh_gaussian_sample
 from qdos_brax.nn.optim import ADAM, adam_step, polyak
 
 Params = Any
-# (observation[B], action[B]) -> log density[B] that the actor is held against; without one, it is uniform (SAC).
-Reference = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 class SACHyper(struct.PyTreeNode):
@@ -49,7 +47,7 @@ class SACState(struct.PyTreeNode):
 
 
 class SAC:
-    """Learn by soft actor-critic with a critic ensemble.
+    """Learn by soft actor-critic with a critic ensemble (``qdos_brax.high_level.actor_critic.ActorCritic``).
 
     Args:
         observation_dim: width of observations.
@@ -70,9 +68,30 @@ class SAC:
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.ensemble, self.target_subset, self.value_scale = config.ensemble, config.target_subset, config.value_scale
         self.entropy_backup = config.regulariser == "prior" if entropy_backup is None else entropy_backup
+        self._by_entropy = config.regulariser == "entropy"
         self.actor = DiagonalGaussian(config.hidden, action_dim)
         self.critic = Ensemble(config.hidden, config.ensemble)
         self._target_heads = Ensemble(config.hidden, config.target_subset)
+
+    def start(self, key: jax.Array, hyper: dict[str, jax.Array]) -> SACState:
+        """Return fresh parameters; reads ``high_level.init_temperature``."""
+        return self.init(key, hyper["high_level.init_temperature"])
+
+    def hyper(self, values: dict[str, jax.Array]) -> SACHyper:
+        """Return learning rate, discount, Polyak rate, and the entropy that the temperature aims at."""
+        aim = -values["high_level.target_divergence"]
+        if self._by_entropy:
+            aim = -values["high_level.target_entropy_scale"] * self.action_dim
+        return SACHyper(
+            learning_rate=values["high_level.learning_rate"],
+            discount=values["high_level.discount"],
+            target_rate=values["high_level.target_rate"],
+            target_entropy=aim,
+        )
+
+    def actor_params(self, state: SACState) -> Params:
+        """Return the actor's parameters."""
+        return state.actor
 
     def init(self, key: jax.Array, init_temperature: jax.Array | float) -> SACState:
         """Return fresh parameters; the target ensemble starts as a copy."""
@@ -161,15 +180,15 @@ class SAC:
     def update_actor(
         self,
         state: SACState,
-        observation: jax.Array,
+        batch: Transition,
         key: jax.Array,
         hyper: SACHyper,
         reference: Reference | None = None,
     ) -> tuple[SACState, dict[str, jax.Array]]:
-        """Make one step of the actor, then one of the temperature towards the target entropy."""
+        """Make one step of the actor on the batch's observations, then one of the temperature towards its aim."""
         temperature = jnp.exp(state.log_temperature)
         (loss, entropy), grads = jax.value_and_grad(self.actor_loss, has_aux=True)(
-            state.actor, state.critic, temperature, observation, key, reference
+            state.actor, state.critic, temperature, batch.observation, key, reference
         )
         actor, actor_opt_state = adam_step(state.actor, state.actor_opt_state, grads, hyper.learning_rate)
         temperature_grad = temperature * (entropy - hyper.target_entropy)

@@ -13,20 +13,24 @@ import numpy as np
 
 from qdos_brax import config as configs
 from qdos_brax.config import Config
-from qdos_brax.config.methods import METHODS
+from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.requirements import refuse, unmet
+from qdos_brax.high_level.actor_critic import AGENT
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.online_phase import OnlinePhase
+from qdos_brax.high_level.warm_up import OfflineWarmUp, RandomWarmUp, WarmUp
 from qdos_brax.labels.bonus import Bonus, NoBonus, RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, OfflineReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
+from qdos_brax.methods.actor_critics import make_actor_critic
 from qdos_brax.methods.context import BuildContext, SpaceSizes, offline_phase
 from qdos_brax.methods.given_skills import GivenSkills, read_skills
 from qdos_brax.methods.low_level_kinds import make_low_level, skill_phases
+from qdos_brax.offline.actor_critic import OfflineActorCritic
 from qdos_brax.offline.bc import BC
 from qdos_brax.offline.diffusion import DiffusionBC
 from qdos_brax.offline.flat_policy import FlatPolicy
@@ -80,12 +84,15 @@ def build_phases(context: BuildContext) -> list[MemberPhase]:
     return [
         *skill_phases(context),
         *([] if guide is None else [offline_phase(context, "guide", guide.learner, config.guide.updates)]),
+        *_continued_phases(context),
         *([_label_phase(context, low_level)] if labelled else []),
         OnlinePhase(
             config,
             env,
             context.normaliser,
             low_level,
+            make_actor_critic(config, env),
+            _warm_up(config, method),
             _labeller(context, low_level),
             _bonus(context, low_level),
             None if guide is None else guide.jump_start,
@@ -117,6 +124,20 @@ def bind_phases(phases: Sequence[MemberPhase], population: Population, data: Dev
     shared = population.shared(data)
     for phase in phases:
         phase.bind(population, shared)
+
+
+def _continued_phases(context: BuildContext) -> list[MemberPhase]:
+    """Return the phase that learns the actor-critic from the data, where the method has one."""
+    config, method = context.config, context.method
+    if method.offline is None:
+        return []
+    learner = OfflineActorCritic(make_actor_critic(config, context.env), config.skills.horizon, config.flow.batch_size)
+    return [offline_phase(context, AGENT, learner, config.flow.updates)]
+
+
+def _warm_up(config: Config, method: Method) -> WarmUp:
+    steps = config.high_level.warmup_env_steps
+    return RandomWarmUp(steps) if method.offline is None else OfflineWarmUp(steps)
 
 
 class _Guide(NamedTuple):

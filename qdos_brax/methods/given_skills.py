@@ -86,7 +86,7 @@ def _look(given: GivenSkills, low_level: LowLevelPolicy, env: Any, horizon: int)
     segments = Segments(jnp.zeros((1, horizon, env.observation_size)), jnp.zeros((1, horizon, env.action_size)))
     latent = low_level.to_latent(given.params, action, normal, 1.0)
     skill = low_level.begin(given.params, latent, normal)
-    return low_level.act(given.params, normal, skill), low_level.posterior(given.params, segments, normal)
+    return low_level.act(given.params, normal, skill, 0), low_level.posterior(given.params, segments, normal)
 
 
 class GivenSkillsState(struct.PyTreeNode):

@@ -15,14 +15,16 @@ from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.methods.context import BuildContext, SpaceSizes, offline_phase
 from qdos_brax.methods.given_skills import GivenSkillsPhase
 from qdos_brax.offline.diveoff import DiveOff
+from qdos_brax.offline.flow_bc import FlowBC
 from qdos_brax.offline.hilbert import Hilbert
 from qdos_brax.population.phase import MemberPhase
+from qdos_brax.skills.chunks import ActionChunks, NoiseChunks
+from qdos_brax.skills.flow_policy import FlowPolicy
 from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
 from qdos_brax.skills.low_level import (
     DirectionSkills,
     LowLevelPolicy,
-    PrimitiveActions,
     TrajectorySkills,
     TransitionSkills,
 )
@@ -99,15 +101,33 @@ def _transition_phases(context: BuildContext) -> list[MemberPhase]:
     return [offline_phase(context, "skills", learner, context.config.diveoff.updates)]
 
 
-def _primitive_actions(config: Config, env: SpaceSizes) -> LowLevelPolicy:
-    return PrimitiveActions(env.action_size)
+def _action_chunks(config: Config, env: SpaceSizes) -> LowLevelPolicy:
+    return ActionChunks(env.action_size, config.skills.horizon)
+
+
+def _flow(config: Config, env: SpaceSizes) -> FlowPolicy:
+    """Return the flow policy over chunks of H actions."""
+    width = config.skills.horizon * env.action_size
+    return FlowPolicy(env.observation_size, width, config.flow.hidden, config.flow.steps)
+
+
+def _noise_chunks(config: Config, env: SpaceSizes) -> LowLevelPolicy:
+    return NoiseChunks(_flow(config, env), env.action_size)
+
+
+def _noise_phases(context: BuildContext) -> list[MemberPhase]:
+    config = context.config
+    learner = FlowBC(_flow(config, context.env), config.skills.horizon, config.flow.batch_size)
+    return [offline_phase(context, "skills", learner, config.flow.updates)]
 
 
 _LOW_LEVEL = {
     "trajectory": _LowLevelKind(_trajectory_skills, _trajectory_phases),
     "transition": _LowLevelKind(_transition_skills, _transition_phases),
     "direction": _LowLevelKind(_direction_skills, _direction_phases),
-    "action": _LowLevelKind(_primitive_actions, lambda context: []),
+    "action": _LowLevelKind(_action_chunks, lambda context: []),
+    "chunk": _LowLevelKind(_action_chunks, lambda context: []),
+    "noise": _LowLevelKind(_noise_chunks, _noise_phases),
 }
 
 

@@ -43,7 +43,7 @@ class BC:
         self.observation_dim, self.action_dim, self.batch_size = observation_dim, action_dim, config.batch_size
         self.policy = GaussianPolicy(config.hidden, action_dim, learned_std)
 
-    def init(self, key: jax.Array) -> BCState:
+    def init(self, key: jax.Array, hyper: dict[str, jax.Array]) -> BCState:
         """Return fresh parameters."""
         actor = self.policy.init(key, jnp.zeros((1, self.observation_dim)))
         return BCState(actor, ADAM.init(actor))

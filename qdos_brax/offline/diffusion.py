@@ -133,7 +133,7 @@ class DiffusionBC:
         self.schedule = variance_preserving_schedule(config.steps)
         self._denoiser = Denoiser(config.hidden, blocks, action_dim, dropout)
 
-    def init(self, key: jax.Array) -> DiffusionState:
+    def init(self, key: jax.Array, hyper: dict[str, jax.Array]) -> DiffusionState:
         """Return fresh parameters; the average starts as a copy."""
         observation, action = jnp.zeros((1, self.observation_dim)), jnp.zeros((1, self.action_dim))
         denoiser = self._denoiser.init(key, observation, action, jnp.zeros(1), False)

@@ -96,7 +96,7 @@ class DiveOff:
         self._encoder = DiagonalGaussian(config.hidden, latent_dim)
         self._decoder = MLP((*config.hidden, observation_dim + action_dim))
 
-    def init(self, key: jax.Array) -> DiveOffState:
+    def init(self, key: jax.Array, hyper: dict[str, jax.Array]) -> DiveOffState:
         """Return fresh parameters; the targets start as copies."""
         actor_key, critic_key, encoder_key, decoder_key = jax.random.split(key, 4)
         pair, latent = jnp.zeros((1, self.observation_dim + self.action_dim)), jnp.zeros((1, self.latent_dim))

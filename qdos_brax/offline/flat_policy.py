@@ -29,6 +29,6 @@ class FlatPolicy:
         """Return the action[..., act] at observation[..., obs]."""
         return self.act(self.params, self.normaliser(observation))
 
-    def play(self, observation: jax.Array, latent: jax.Array) -> jax.Array:
+    def play(self, observation: jax.Array, latent: jax.Array, step: jax.Array | int) -> jax.Array:
         """Return the decision itself."""
         return latent

@@ -106,12 +106,12 @@ class Hilbert:
         policy = PolicyConfig(hidden=config.hidden, batch_size=config.batch_size)
         self.skills = IQLPolicy(width, action_dim, policy, IQL(width, action_dim, config.hidden))
 
-    def init(self, key: jax.Array) -> HilbertState:
+    def init(self, key: jax.Array, hyper: dict[str, jax.Array]) -> HilbertState:
         """Return fresh parameters; the target starts as a copy."""
         phi_key, skills_key = jax.random.split(key)
         heads = jax.random.split(phi_key, _HEADS)
         phi = jax.vmap(self._phi.init, in_axes=(0, None))(heads, jnp.zeros((1, self.observation_dim)))
-        return HilbertState(phi, jax.tree.map(jnp.copy, phi), ADAM.init(phi), self.skills.init(skills_key))
+        return HilbertState(phi, jax.tree.map(jnp.copy, phi), ADAM.init(phi), self.skills.init(skills_key, hyper))
 
     # --- What it gives to others, from ``params`` ------------------------------------------------------------
 

@@ -61,7 +61,7 @@ class IQLPolicy:
         self.values = values
         self.policy = GaussianPolicy(config.hidden, action_dim)
 
-    def init(self, key: jax.Array) -> IQLPolicyState:
+    def init(self, key: jax.Array, hyper: dict[str, jax.Array]) -> IQLPolicyState:
         """Return fresh parameters."""
         values_key, actor_key = jax.random.split(key)
         actor = self.policy.init(actor_key, jnp.zeros((1, self.observation_dim)))

@@ -12,8 +12,8 @@ from qdos_brax.data.device import DeviceData
 class Learner(Protocol):
     """Define a learner on the data set; everything it does is of one member of the population and can be jitted."""
 
-    def init(self, key: jax.Array) -> Any:
-        """Return its state, a pytree of arrays."""
+    def init(self, key: jax.Array, hyper: dict[str, jax.Array]) -> Any:
+        """Return its state, a pytree of arrays; ``hyper`` holds one member's numbers by dotted configuration key."""
         ...
 
     def update(

@@ -107,7 +107,8 @@ class OfflinePhase(MemberPhase):
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> OfflinePhaseState:
         """Return a fresh learner."""
         learner_key, key = jax.random.split(key)
-        return OfflinePhaseState(key, self._learner.init(learner_key), jnp.zeros((), jnp.int32), jnp.ones((), bool))
+        learner = self._learner.init(learner_key, hyper)
+        return OfflinePhaseState(key, learner, jnp.zeros((), jnp.int32), jnp.ones((), bool))
 
     def train_member(
         self, state: OfflinePhaseState, constants: dict[str, Any], hyper: dict[str, jax.Array], data: DeviceData

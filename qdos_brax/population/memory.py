@@ -80,7 +80,7 @@ def estimate(phases: Sequence[Sized], shared: int) -> MemoryEstimate:
     artifacts: dict[str, Any] = {}
     kept = working = 0
     for phase in phases:
-        state, constants = jax.eval_shape(lambda key, phase=phase, given=artifacts: phase.init(key, given), key)
+        state, constants = jax.eval_shape(phase.init, key, artifacts)
         kept = max(kept, num_bytes(state) + num_bytes(artifacts))
         working = max(working, phase.working_bytes(state, constants))
         artifacts = jax.eval_shape(phase.finish, state, artifacts)

@@ -60,8 +60,8 @@ class LowLevelPolicy(Protocol):
         """Return skill[..., s]: z, then whatever must be remembered of observation[..., obs], where it begins."""
         ...
 
-    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
-        """Return the action[..., act] of a skill that has begun, in [-1, 1]."""
+    def act(self, params: Any, observation: jax.Array, skill: jax.Array, step: jax.Array | int) -> jax.Array:
+        """Return the action[..., act] of a skill that began ``step`` steps ago, in [-1, 1]."""
         ...
 
 
@@ -79,7 +79,7 @@ class LatentModel(Protocol):
         ...
 
 
-class _AnywhereSkills:
+class AnywhereSkills:
     """Play skills that remember nothing of where they begin."""
 
     def begin(self, params: Any, latent: jax.Array, observation: jax.Array) -> jax.Array:
@@ -87,7 +87,7 @@ class _AnywhereSkills:
         return latent
 
 
-class LatentSkills(_AnywhereSkills):
+class LatentSkills(AnywhereSkills):
     """Play the latents of a model with a state prior; subclasses add the posterior.
 
     Args:
@@ -119,7 +119,7 @@ class LatentSkills(_AnywhereSkills):
         latent = mapping.to_latent(action, prior)
         return gaussian_log_prob(latent, *prior) + mapping.log_jacobian(action, prior)
 
-    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
+    def act(self, params: Any, observation: jax.Array, skill: jax.Array, step: jax.Array | int) -> jax.Array:
         """Return the decoder's mean action."""
         return self._model.act(params, observation, skill)
 
@@ -173,7 +173,7 @@ class TransitionSkills(LatentSkills):
         return Posterior(jnp.mean(mean, axis=1), 0.5 * jnp.log(variance))
 
 
-class DirectionSkills(_AnywhereSkills):
+class DirectionSkills(AnywhereSkills):
     """Play directions of travel in a representation of states: z is a unit vector, and so is every u's (HILP).
 
     Args:
@@ -213,42 +213,6 @@ class DirectionSkills(_AnywhereSkills):
         """Return the log density of the uniform distribution over u."""
         return jnp.full(action.shape[:-1], -self.width * jnp.log(2.0))
 
-    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
+    def act(self, params: Any, observation: jax.Array, skill: jax.Array, step: jax.Array | int) -> jax.Array:
         """Return the directional policy's action."""
         return self._act(params, observation, skill)
-
-
-class PrimitiveActions(_AnywhereSkills):
-    """Play no skills: u is the action itself, and a segment is one step (RLPD, ExPLORe).
-
-    Args:
-        action_dim: width of actions.
-    """
-
-    def __init__(self, action_dim: int) -> None:
-        self.width = action_dim
-
-    def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
-        """Return the segment's own action."""
-        action = segments.actions[:, 0]
-        return Posterior(action, jnp.full_like(action, -jnp.inf))
-
-    def to_latent(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """Return z = u."""
-        return action
-
-    def to_action(self, params: Any, latent: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """Return u = z, where the actor's density is finite."""
-        return jnp.clip(latent, -1 + MARGIN, 1 - MARGIN)
-
-    def first(self, params: Any, key: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """Return an action, uniform over the box."""
-        return jax.random.uniform(key, (*observation.shape[:-1], self.width), minval=-1.0)
-
-    def log_prior(self, params: Any, action: jax.Array, observation: jax.Array, box: Box) -> jax.Array:
-        """Return the log density of the uniform distribution."""
-        return jnp.full(action.shape[:-1], -self.width * jnp.log(2.0))
-
-    def act(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
-        """Return z itself."""
-        return skill

@@ -67,7 +67,7 @@ def test_evaluate_films_the_first_episode(
     trained = finished_runs.load_run(finished)
     agent = trained.agent(*jax.tree.map(lambda x: x[0], (trained.artifacts, trained.hyper)))
     state = trained.env.reset(jax.random.split(finished_runs.evaluation_key(), 2)[0])
-    step = jax.jit(lambda state, latent: trained.env.step(state, agent.play(state.obs, latent)))
+    step = jax.jit(lambda state, latent: trained.env.step(state, agent.play(state.obs, latent, 0)))
     for t in range(11):
         np.testing.assert_allclose(drawn[t][0], state.pipeline_state.qpos, atol=1e-3)
         np.testing.assert_array_equal(drawn[t][1], trained.env.goal_xy)

@@ -173,6 +173,6 @@ def test_a_member_keeps_the_value_of_a_labelled_key_under_its_label() -> None:
 
 def test_pretrain_steps_are_marked_in_the_schema() -> None:
     """Every group that learns from the data alone has its budget under the mark, and no other key."""
-    groups = ("values", "skills", "policy", "guide", "hilbert", "diveoff")
+    groups = ("values", "skills", "policy", "guide", "hilbert", "diveoff", "flow")
     assert schema.pretrain_keys() == [f"{group}.updates" for group in groups]
     assert [key for key, _ in schema.leaves(Config) if key.endswith(".updates")] == schema.pretrain_keys()

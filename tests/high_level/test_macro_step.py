@@ -42,7 +42,7 @@ class Line(Env):
 
 def play(env, horizon, discount, action=1.0, state=None):
     state = env.reset(jax.random.key(0)) if state is None else state
-    return macro_step(env, lambda obs: jnp.full(1, action), state, horizon, discount)
+    return macro_step(env, lambda obs, step: jnp.full(1, action), state, horizon, discount)
 
 
 def test_reward_is_discounted_and_the_mask_stays_without_an_end():
@@ -91,7 +91,7 @@ def test_reset_only_where_the_episode_is_over():
 @pytest.mark.parametrize(("goal", "success", "total", "length"), [(7.0, 1.0, -7.0, 8), (1000.0, 0.0, -20.0, 20)])
 def test_evaluation_plays_whole_episodes(goal, success, total, length):
     env = Line(goal=goal, cap=20)
-    episodes = evaluate(env, lambda obs: jnp.ones(1), lambda obs, z: z, jax.random.key(0), episodes=3, horizon=6)
+    episodes = evaluate(env, lambda obs: jnp.ones(1), lambda obs, z, step: z, jax.random.key(0), episodes=3, horizon=6)
     np.testing.assert_array_equal(episodes.success, [success] * 3)
     np.testing.assert_array_equal(episodes.episode_return, [total] * 3)
     np.testing.assert_array_equal(episodes.length, [length] * 3)

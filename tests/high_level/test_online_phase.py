@@ -10,6 +10,8 @@ from qdos_brax.data.device import Normaliser, to_device
 from qdos_brax.data.transitions import Transition
 from qdos_brax.high_level.learning import Sources
 from qdos_brax.high_level.online_phase import OnlinePhase
+from qdos_brax.high_level.sac import SAC
+from qdos_brax.high_level.warm_up import RandomWarmUp
 from qdos_brax.labels.bonus import NoBonus, RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
@@ -52,7 +54,8 @@ def online_phase(plane, config, labeller=None, bonus=None):
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
     bonus = bonus or RNDBonus(RND(2 + low_level.width, config.labels.rnd_hidden, config.labels.rnd_features), as_it_is)
     labeller = labeller or DataReward()
-    phase = OnlinePhase(config, PointEnv(), normaliser, low_level, labeller, bonus, steps_per_chunk=100)
+    sac, warm_up = SAC(2, low_level.width, config.high_level), RandomWarmUp(config.high_level.warmup_env_steps)
+    phase = OnlinePhase(config, PointEnv(), normaliser, low_level, sac, warm_up, labeller, bonus, steps_per_chunk=100)
     repeated = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), artifacts)
     return bound(phase, config, data), repeated, phase_keys(seeds, 2)
 
@@ -137,7 +140,7 @@ def test_seeds_differ_and_repeat(pair):
     results = []
     for _ in range(2):
         state, _ = phase.chunk(*phase.init(keys, artifacts))
-        results.append([np.asarray(leaf) for leaf in jax.tree.leaves(state.learners.sac.actor)])
+        results.append([np.asarray(leaf) for leaf in jax.tree.leaves(state.learners.high_level.actor)])
     for a, b in zip(*results, strict=True):
         np.testing.assert_array_equal(a, b)
     assert any(not np.array_equal(a[0], a[1]) for a in results[0])
@@ -147,11 +150,11 @@ def test_a_member_that_diverges_is_frozen_and_the_other_is_as_without_it(pair):
     phase, artifacts, keys = pair
     alone, _ = phase.chunk(*phase.init(keys, artifacts))
     state, constants = phase.init(keys, artifacts)
-    broken = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.learners.sac.critic)
-    learners = state.learners.replace(sac=state.learners.sac.replace(critic=broken))
+    broken = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.learners.high_level.critic)
+    learners = state.learners.replace(high_level=state.learners.high_level.replace(critic=broken))
     after, metrics = phase.chunk(state.replace(learners=learners), constants)
     np.testing.assert_array_equal(metrics["status_ok"], [True, False])
-    leaves = zip(jax.tree.leaves(alone.learners.sac), jax.tree.leaves(after.learners.sac), strict=True)
+    leaves = zip(jax.tree.leaves(alone.learners.high_level), jax.tree.leaves(after.learners.high_level), strict=True)
     for expected, found in leaves:
         np.testing.assert_array_equal(found[0], expected[0])
 
@@ -260,7 +263,7 @@ def test_actor_steps_lie_evenly_among_the_critics(plane):
         config = point_config(**{"high_level.utd": 4, "high_level.actor_updates": actor_updates})
         phase, artifacts, keys = online_phase(plane, config)
         state, _ = phase.chunk(*phase.init(keys, artifacts))
-        played, sac = int(state.acting.replay.size[0]), state.learners.sac
+        played, sac = int(state.acting.replay.size[0]), state.learners.high_level
         steps = [int(opt_state.count[0]) for opt_state in (sac.critic_opt_state, sac.actor_opt_state)]
         assert steps == [4 * played, actor_updates * played]
         assert int(sac.temperature_opt_state.count[0]) == steps[1] and int(state.update[0]) == steps[0]

@@ -85,9 +85,10 @@ def test_actor_loss_is_temperature_times_log_density_minus_mean_q(sac):
 
 def test_temperature_rises_when_entropy_is_below_its_target(sac):
     state = sac.init(jax.random.key(0), 0.1)
-    observation = jnp.zeros((4, 3))
+    zeros = jnp.zeros(4)
+    batch = Transition(jnp.zeros((4, 3)), zeros, zeros, zeros, zeros)  # the actor reads the observations alone
     for target, sign in ((100.0, 1), (-100.0, -1)):
-        new, _ = sac.update_actor(state, observation, jax.random.key(0), HYPER.replace(target_entropy=target))
+        new, _ = sac.update_actor(state, batch, jax.random.key(0), HYPER.replace(target_entropy=target))
         assert np.sign(float(new.log_temperature - state.log_temperature)) == sign
 
 
@@ -148,7 +149,7 @@ def test_sac_reaches_the_known_optimum_of_a_point_task():
             index = jax.random.randint(index_key, (64,), 0, 2048)
             batch = jax.tree.map(lambda a: a[index], rows)
             state, _ = sac.update_critic(state, batch, critic_key, hyper)
-            state, _ = sac.update_actor(state, batch.observation, actor_key, hyper)
+            state, _ = sac.update_actor(state, batch, actor_key, hyper)
             return state, None
 
         return jax.lax.scan(step, state, jax.random.split(key, 1500))[0]

@@ -15,8 +15,9 @@ from qdos_brax.analysis.finished import evaluate_run
 from qdos_brax.commands.train import train_main
 from qdos_brax.config.methods import METHODS
 from qdos_brax.nn.networks import gaussian_log_prob
+from qdos_brax.skills.chunks import ActionChunks
 from qdos_brax.skills.latent_map import Prior, latent_map
-from qdos_brax.skills.low_level import DirectionSkills, PrimitiveActions, TransitionSkills
+from qdos_brax.skills.low_level import DirectionSkills, TransitionSkills
 from qdos_brax.skills.vae import Segments
 
 
@@ -28,11 +29,11 @@ def segments() -> tuple[Segments, jax.Array]:
 
 
 def test_an_action_is_its_own_label() -> None:
-    source, (batch, after) = PrimitiveActions(2), segments()
+    source, (batch, after) = ActionChunks(2), segments()
     mean, log_std = source.posterior({}, batch, after)
     np.testing.assert_array_equal(mean + jnp.exp(log_std), batch.actions[:, 0])
     action = source.to_action({}, mean, after, 2.0)
-    np.testing.assert_array_equal(source.act({}, after, source.to_latent({}, action, after, 2.0)), mean)
+    np.testing.assert_array_equal(source.act({}, after, source.to_latent({}, action, after, 2.0), 0), mean)
 
 
 def test_a_direction_is_that_from_first_to_last_state() -> None:

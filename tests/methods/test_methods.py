@@ -25,12 +25,13 @@ from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.learning import Sources
 from qdos_brax.high_level.replay import insert
 from qdos_brax.high_level.sac import SAC
+from qdos_brax.high_level.warm_up import RandomWarmUp
 from qdos_brax.methods.build import build_context, build_phases
 from qdos_brax.nn.networks import gaussian_log_prob
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
+from qdos_brax.skills.chunks import ActionChunks
 from qdos_brax.skills.latent_map import Prior, latent_map
-from qdos_brax.skills.low_level import PrimitiveActions
 from tests.point import (
     GOAL,
     STEP,
@@ -55,6 +56,10 @@ PHASES = {
     "iql": ["policy"],
     "bc": ["policy"],
     "diveoff": ["skills", "label", "online"],
+    "qc": ["agent", "label", "online"],
+    "qc-fql": ["agent", "label", "online"],
+    "fql": ["agent", "label", "online"],
+    "dsrl": ["skills", "online"],
 }
 
 
@@ -165,9 +170,9 @@ def test_the_guide_acts_first_and_only_so_long() -> None:
     config = config_of("diffusion-jsrl", **{"high_level.warmup_env_steps": 0})
     guide = JumpStart(lambda params, key, observation: jnp.full((observation.shape[0], 2), 0.123), 0.9, 0.99)
     _, normaliser = to_device(point_dataset(20), 1)
-    acting = Acting(config, PointEnv(), normaliser, 10, guide)
+    acting = Acting(config, PointEnv(), normaliser, 10, RandomWarmUp(0), guide)
     sac, hyper = SAC(2, 2, config.high_level), first_member(configs.population_hyper(config))
-    agent = Agent(normaliser, PrimitiveActions(2), sac, 1.0, {}, sac.init(jax.random.key(1), 1.0).actor)
+    agent = Agent(normaliser, ActionChunks(2), sac, 1.0, {}, sac.init(jax.random.key(1), 1.0).actor)
     row = Transition(jnp.zeros(2), jnp.zeros(2), jnp.zeros(()), jnp.zeros(()), jnp.zeros(2))
     state = acting.start(jax.random.key(0), row).replace(guided=jnp.array([3, 0]))
     act = jax.jit(lambda state, key: acting.step(state, key, agent, {}, hyper)[0])

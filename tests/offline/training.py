@@ -18,7 +18,7 @@ def train(learner, data, hyper, updates, seed=0):
     def run(key, data, updates):
         init_key, key = jax.random.split(key)
         step = lambda state, key: learner.update(state, data, key, hyper)  # noqa: E731
-        state, info = jax.lax.scan(step, learner.init(init_key), jax.random.split(key, updates))
+        state, info = jax.lax.scan(step, learner.init(init_key, hyper), jax.random.split(key, updates))
         return state, jax.tree.map(jnp.mean, info)
 
     return run(jax.random.key(seed), data, updates)
@@ -32,7 +32,7 @@ def train_members(learner, data, hyper, updates):
     def run(data):
         def one(hyper):
             step = lambda state, key: learner.update(state, data, key, hyper)  # noqa: E731
-            return jax.lax.scan(step, learner.init(jax.random.key(1)), keys)[0]
+            return jax.lax.scan(step, learner.init(jax.random.key(1), hyper), keys)[0]
 
         return jax.vmap(one)(jax.tree.map(jnp.asarray, hyper))
 

@@ -17,6 +17,8 @@ from qdos_brax.config import Config
 from qdos_brax.data.device import to_device
 from qdos_brax.high_level.macro_step import macro_step, reset_done
 from qdos_brax.high_level.online_phase import OnlinePhase
+from qdos_brax.high_level.sac import SAC
+from qdos_brax.high_level.warm_up import RandomWarmUp
 from qdos_brax.labels.bonus import NoBonus
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward
@@ -52,7 +54,10 @@ def phases() -> dict[str, Any]:
     information = PhysicsRollout(PointEnv(), model, normaliser, config.skills.horizon)
     low_level = TrajectorySkills(model, "box")
     policy = BC(2, 2, configs.PolicyConfig(hidden=(16,), batch_size=16))
-    online = OnlinePhase(config, PointEnv(), normaliser, low_level, DataReward(), NoBonus(), steps_per_chunk=100)
+    sac, warm_up = SAC(2, low_level.width, config.high_level), RandomWarmUp(config.high_level.warmup_env_steps)
+    online = OnlinePhase(
+        config, PointEnv(), normaliser, low_level, sac, warm_up, DataReward(), NoBonus(), steps_per_chunk=100
+    )
     phases = {
         "values": ValuePhase(config, IQL(2, 2, (16,)), updates_per_chunk=10),
         "skills": SkillPhase(config, model, LoggedWeights(), information, blocks_per_chunk=1),
@@ -170,7 +175,7 @@ def test_one_broken_simulation_is_reset_and_the_others_go_on_as_without_it(engin
 
     @jax.jit
     def iteration(state: Any, keys: jax.Array) -> Any:
-        play = lambda obs: jnp.tanh(obs[: env.action_size])  # noqa: E731
+        play = lambda obs, step: jnp.tanh(obs[: env.action_size])  # noqa: E731
         state, result = jax.vmap(lambda one: macro_step(env, play, one, 3, 0.99))(state)
         after = jax.vmap(lambda one, broken, key: reset_done(env, one, broken, key))(state, ~result.finite, keys)
         return after, result

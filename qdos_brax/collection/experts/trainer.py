@@ -173,7 +173,7 @@ class Trainer:
             straight = jax.random.bernoulli(mirror_key, shape=batch.reward.shape)
             batch = _select_rows(straight, batch, self.task.mirror(batch))
             sac, info = self.sac.update_critic(sac, batch, critic_key, self.hyper)
-        sac, actor_info = self.sac.update_actor(sac, batch.observation, actor_key, self.hyper)
+        sac, actor_info = self.sac.update_actor(sac, batch, actor_key, self.hyper)
         return sac, {**info, **actor_info}
 
     @partial(jax.jit, static_argnums=0)
