@@ -90,9 +90,8 @@ def _models() -> tuple[bool, str]:
         try:
             found.append(f"{tasks} ({package} {metadata.version(package)})")
         except metadata.PackageNotFoundError:
-            absent += (
-                f"; not {tasks}: {package} is not installed; run: pip install -c constraints.txt -e '.[manipulation]'"
-            )
+            remedy = "run: pip install -c constraints.txt -e '.[manipulation]'"
+            absent += f"; not {tasks}: {package} is not installed; {remedy}"
     return True, f"models: {', '.join(['mazes', *found])}{absent}"
 
 
