@@ -26,6 +26,7 @@ _PACKAGES = (
     "h5py",
     "numpy",
 )
+_MODELS = {"kitchen": "gymnasium-robotics", "cube and scene": "ogbench"}  # tasks by the package that has their models
 _WATCHDOG_SECONDS = 120
 
 # A batched scan over calls of NumPy, as the MuJoCo C engine makes them. It runs in a process of its own, because a call
@@ -50,6 +51,7 @@ def examine() -> bool:
     checks: tuple[Callable[[], tuple[bool, str]], ...] = (
         _python,
         _packages,
+        _models,
         _devices,
         _engines,
         _compile_cache,
@@ -79,6 +81,18 @@ def _packages() -> tuple[bool, str]:
     if missing:
         return False, f"packages: {', '.join(missing)} not installed; run: pip install -c constraints.txt -e ."
     return True, f"packages: qdos-brax {__version__}, {', '.join(found)}"
+
+
+def _models() -> tuple[bool, str]:
+    """List the tasks whose models are in packages of an extra; that one is not installed is no failure."""
+    found, absent = [], ""
+    for tasks, package in _MODELS.items():
+        try:
+            found.append(f"{tasks} ({package} {metadata.version(package)})")
+        except metadata.PackageNotFoundError:
+            remedy = "run: pip install -c constraints.txt -e '.[manipulation]'"
+            absent += f"; not {tasks}: {package} is not installed; {remedy}"
+    return True, f"models: {', '.join(['mazes', *found])}{absent}"
 
 
 def _devices() -> tuple[bool, str]:

@@ -18,6 +18,7 @@ from envs import render
 from envs.manipulation.kitchen_rig import START_QPOS, SUBTASKS
 from envs.physics.mujoco.engine import _SENSORS
 from qdos_brax.collection.scripted.kitchen import KitchenDemonstrator
+from qdos_brax.commands import doctor
 from qdos_brax.high_level.evaluation import evaluate, summary
 from tests.collection.scripted.kitchen_player import play
 from tests.envs.kitchen_reference import kitchen, reference, rollout
@@ -213,6 +214,14 @@ def test_a_picture_shows_the_arm_and_what_it_moves(env: Any) -> None:
     with render.Renderer(env, 96) as renderer:
         shut, moved = renderer.frame(START_QPOS, ()), renderer.frame(opened, ())
     assert shut.shape == (96, 128, 3) and shut.std() > 20 and (shut != moved).any()
+
+
+def test_doctor_says_where_the_models_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    passed, line = doctor._models()
+    assert passed and "kitchen (gymnasium-robotics 1.4." in line and "not" not in line
+    monkeypatch.setattr(doctor, "_MODELS", {"kitchen": "no-such-package"})
+    passed, line = doctor._models()  # which is no fault of the machine's
+    assert passed and line.startswith("models: mazes; not kitchen: no-such-package is not installed; run: pip install")
 
 
 def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
