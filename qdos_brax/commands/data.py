@@ -50,7 +50,7 @@ def add_parser(commands: Any) -> None:
         "--noise",
         metavar="X",
         type=float,
-        help="action noise of the other episodes (default 0.2; explore: 1, humanoid 0.4)",
+        help="action noise of the other episodes (default 0.2; cubes and scene 0.1; explore: 1, humanoid 0.4)",
     )
     make.add_argument("--seed", metavar="S", type=int, default=0, help="seed (default 0)")
     make.add_argument("--num-envs", metavar="N", type=int, default=64, help="environments at once (default 64)")
@@ -97,20 +97,23 @@ def _make(args: argparse.Namespace) -> int:
     path = Path(args.out).expanduser()
     if path.suffix not in (".hdf5", ".h5"):
         raise UserError(f"--out {args.out}: data is written as .hdf5; give the file that ending")
-    maker = maker_of(_env(args.task, args.physics))
-    make_file(path, maker.collector(_recipe(args, maker)), args.transitions, args.seed, args.num_envs)
+    env = _env(args.task, args.physics)
+    maker = maker_of(env)
+    make_file(
+        path, maker.collector(_recipe(args, maker, env.spec.full_name)), args.transitions, args.seed, args.num_envs
+    )
     print(path)
     return 0
 
 
-def _recipe(args: argparse.Namespace, maker: CollectorMaker) -> recipes.CollectionRecipe:
+def _recipe(args: argparse.Namespace, maker: CollectorMaker, task: str) -> recipes.CollectionRecipe:
     if args.recipe != "mixed":
         if args.mix is not None or args.degraded_share is not None:
             raise UserError(
                 f"--recipe {args.recipe} takes neither --mix nor --degraded-share; use them with --recipe mixed"
             )
         return maker.named(args.recipe, args.noise)
-    noise = recipes.NOISE if args.noise is None else args.noise
+    noise = load_config(task).data.noise if args.noise is None else args.noise
     if args.mix is None:
         return recipes.degraded(0.5 if args.degraded_share is None else args.degraded_share, maker, noise)
     if args.degraded_share is not None:
