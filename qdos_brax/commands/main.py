@@ -65,6 +65,9 @@ def main_parser(argv: Sequence[str], prog: str = _PROGRAM) -> Parser:
         metavar="METHOD",
         help="the method to compare the others with (default supe, else the first)",
     )
+    report.add_argument(
+        "--published", action="store_true", help="also show what others published for the tasks, in their own settings"
+    )
     report.set_defaults(run=_report)
 
     picture = commands.add_parser("picture", help="draw a task at its start, or an episode and the latents of a run")
@@ -123,7 +126,7 @@ def _report(args: argparse.Namespace) -> int:
 
     runs = [Path(run) for run in args.runs]
     out = Path(args.out) if args.out else runs[0] if len(runs) == 1 else Path("report")
-    report = write_report(runs, out, args.reference)
+    report = write_report(runs, out, args.reference, args.published)
     print(f"{report.text}\n")
     for file in report.files:
         print(file)

@@ -18,6 +18,7 @@ from qdos_brax.report.elements import PALETTE
 from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
 from qdos_brax.report.study import Study, format_value, short_key
 
+GREYS = ("#4d4d4d", "#7a7a7a", "#a5a5a5")  # of what others published
 TICKS = 8  # the most values of a scan that all get a label on its axis
 MEASURES = (("eval/success", "success"), ("eval/score", "score"), ("eval/return", "return"))
 
@@ -26,7 +27,8 @@ def draw_curves(study: Study, out: Path) -> None:
     """Draw success, return and, where a task has one, the score over the environment steps, a row of panels per task.
 
     A thick line is the mean of a setting's members, the band its 95 % bootstrap interval, a thin line a member. A
-    dashed horizontal line is a method that only learned offline.
+    dashed horizontal line is a method that only learned offline, a dotted one what others published at the end of their
+    runs.
 
     Args:
         study: what was run.
@@ -46,6 +48,8 @@ def draw_curves(study: Study, out: Path) -> None:
         for axis, (column, name) in zip(row, measures, strict=True):
             for curve in curves(study, task, column):
                 _draw_curve(axis, curve, colours[curve.setting.label])
+            if name == "success":
+                _draw_published(axis, study, task)
             axis.set_xlabel("environment steps")
             axis.set_ylabel(name)
             axis.set_title(task)
@@ -98,6 +102,11 @@ def _draw_curve(axis: Axes, curve: Curve, colour: str) -> None:
     for member, xy in curve.members:
         if member.frozen:
             axis.plot(*xy[:, -1], "x", color=colour, markersize=9)
+
+
+def _draw_published(axis: Axes, study: Study, task: str) -> None:
+    for row, grey in zip((row for row in study.published if row.task == task), itertools.cycle(GREYS), strict=False):
+        axis.axhline(row.success, color=grey, linestyle=":", linewidth=1, label=row.label)
 
 
 def _draw_scan(axis: Axes, scan: Scan) -> None:

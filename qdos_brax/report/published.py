@@ -1,44 +1,80 @@
-"""The figures of the QDOS paper (its tables 1 and 2), to stand beside those of a report's runs."""
+"""Numbers that others published for the tasks of a report: in settings of their own, and marked so wherever shown."""
 
 from __future__ import annotations
 
+import csv
+import math
 from collections.abc import Sequence
-
-from qdos_brax.report.tables import Table
-
-# Success in %, mean and standard deviation over 3 seeds, by task and method as the paper names them.
-_SUCCESS = {
-    "antmaze-large-task1": {"bc": "41", "iql": "64", "supe": "83 ± 21", "qdos 0.2": "86 ± 6", "qdos 0.3": "96 ± 6"},
-    "antsoccer-arena-task1": {"bc": "5", "iql": "50", "supe": "27 ± 31", "qdos 0.2": "73 ± 31", "qdos 0.3": "80 ± 10"},
-    "humanoidmaze-medium-task1": {
-        "bc": "8",
-        "iql": "27",
-        "supe": "97 ± 6",
-        "qdos 0.2": "97 ± 6",
-        "qdos 0.3": "100 ± 0",
-    },
-    "scene-task1": {"bc": "5", "iql": "51", "supe": "100", "qdos 0.2": "100", "qdos 0.3": "100"},
-}
-# Environment steps to the first goal.
-_FIRST_GOAL = {
-    "antmaze-large-task1": {"supe": "13,334 ± 5,774", "qdos": "11,668 ± 9,465"},
-    "humanoidmaze-medium-task1": {"supe": "23,334 ± 6,292", "qdos": "19,168 ± 8,036"},
-    "scene-task1": {"supe": "5,834 ± 1,443", "qdos": "5,001 ± 0"},
-}
-_NOTE = (
-    "from the paper, on OGBench's data, at its sizes and budgets, 3 seeds: not the conditions of the runs above unless "
-    "preset and data say so; - where the paper has no figure"
-)
+from importlib import resources
+from typing import NamedTuple
 
 
-def published_tables(tasks: Sequence[str]) -> list[Table]:
-    """Return the paper's figures for those of the tasks (full names) that it has, one table each of its two."""
-    titles = {"Published: success (%)": _SUCCESS, "Published: environment steps to the first goal": _FIRST_GOAL}
-    return [table for title, found in titles.items() for table in _table(title, found, tasks)]
+class Published(NamedTuple):
+    """Hold one published result; nan and None for what the source does not say.
+
+    Attributes:
+        task: as the report names it.
+        method: its authors' name for it.
+        success: at the end, 0 to 1.
+        std: over seeds, of success.
+        before: success after the offline steps, 0 to 1.
+        offline_steps: gradient steps on the data.
+        online_steps: environment steps.
+        seeds: how many.
+        first_goal: environment steps to the first goal, the mean over seeds.
+        first_goal_std: its standard deviation.
+        source: publication and table.
+    """
+
+    task: str
+    method: str
+    success: float
+    std: float
+    before: float
+    offline_steps: int | None
+    online_steps: int | None
+    seeds: int | None
+    first_goal: float
+    first_goal_std: float
+    source: str
+
+    @property
+    def label(self) -> str:
+        """Return the method's name, marked as published."""
+        return f"{self.method}, published"
 
 
-def _table(title: str, found: dict[str, dict[str, str]], tasks: Sequence[str]) -> list[Table]:
-    known = [task for task in tasks if task in found]
-    methods = dict.fromkeys(method for task in known for method in found[task])
-    rows = [[method, *(found[task].get(method, "-") for task in known)] for method in methods]
-    return [Table(title, ["method", *known], rows, _NOTE)] if known else []
+def published_on(tasks: Sequence[str]) -> list[Published]:
+    """Return the published results on tasks by their full names, such as antmaze-large-task1.
+
+    A result for an environment without a task's number (a mean over its tasks) is one for each of them.
+    """
+    text = resources.files(__package__).joinpath("published.csv").read_text(encoding="utf-8")
+    rows = list(csv.DictReader(text.splitlines()))
+    return [
+        _published(row, task) for task in tasks for row in rows if row["task"] in (task, task.rpartition("-task")[0])
+    ]
+
+
+def _published(row: dict[str, str], task: str) -> Published:
+    return Published(
+        task,
+        row["method"],
+        _number(row["success"]) / 100,
+        _number(row["std"]) / 100,
+        _number(row["before"]) / 100,
+        _count(row["offline_steps"]),
+        _count(row["online_steps"]),
+        _count(row["seeds"]),
+        _number(row["first_goal"]),
+        _number(row["first_goal_std"]),
+        row["source"],
+    )
+
+
+def _number(cell: str) -> float:
+    return float(cell) if cell else math.nan
+
+
+def _count(cell: str) -> int | None:
+    return int(cell) if cell else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -78,7 +78,8 @@ def learning_section(study: Study) -> Section:
     figures = [
         Figure(
             title_with_task(study, name, task),
-            [trace for curve in drawn for trace in _curve(curve, colours[curve.setting.label])],
+            [trace for curve in drawn for trace in _curve(curve, colours[curve.setting.label])]
+            + (_published(study, task, drawn) if name == "success" else []),
             axis_layout("environment steps", name, share=name in ("success", "score")),
         )
         for task in study.tasks
@@ -88,8 +89,8 @@ def learning_section(study: Study) -> Section:
     ]
     text = (
         "Thick line: the mean over a setting's members; band: its 95 % bootstrap interval; thin lines: the members. "
-        "Dashed: methods that only learn offline. Cross: the member was frozen there, because its numbers were no "
-        "longer finite."
+        "Dashed: methods that only learn offline. Dotted: what others published, in settings of their own. Cross: the "
+        "member was frozen there, because its numbers were no longer finite."
     )
     return Section("Learning curves", text, figures=figures)
 
@@ -110,6 +111,17 @@ def _curve(curve: Curve, colour: str) -> Iterable[Trace]:
         if member.frozen:
             name = {"name": f"{label}, {member_name(member)}"}
             yield member_dot(member, float(x[-1]), float(y[-1]), colour, size=12) | name
+
+
+def _published(study: Study, task: str, drawn: Sequence[Curve]) -> list[Trace]:
+    """Return dotted grey lines at what others published, over the steps of the curves."""
+    end = max((float(curve.steps[-1]) for curve in drawn if len(curve.steps)), default=1.0)
+    line = {"mode": "lines", "line": {"color": "#7a7a7a", "dash": "dot", "width": 1}}
+    return [
+        {"x": [0, end], "y": json_numbers([row.success] * 2), "name": f"{row.label} ({row.source})", **line}
+        for row in study.published
+        if row.task == task
+    ]
 
 
 def _level(curve: Curve, colour: str) -> Trace:

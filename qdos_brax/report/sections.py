@@ -5,7 +5,6 @@ from __future__ import annotations
 from qdos_brax.report.analysis_sections import analysis_sections
 from qdos_brax.report.elements import Section
 from qdos_brax.report.member_analysis import MemberAnalysis
-from qdos_brax.report.published import published_tables
 from qdos_brax.report.result_sections import first_goal_section, learning_section, scan_section, summary_section
 from qdos_brax.report.run_sections import diagnostics_section, provenance_section, wall_time_section
 from qdos_brax.report.study import Study
@@ -19,7 +18,7 @@ def sections(study: Study, analyses: list[MemberAnalysis]) -> list[Section]:
         learning_section(study),
         scan_section(study),
         first_goal_section(study),
-        Section("Tables", tables=[*tables(study), *published_tables(study.tasks)]),
+        Section("Tables", tables=tables(study)),
         *analysis_sections(analyses),
         wall_time_section(study),
         diagnostics_section(study),

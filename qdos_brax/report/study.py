@@ -13,6 +13,7 @@ from typing import Any
 from qdos_brax.config import Config, from_yaml, nearest, values_by_key
 from qdos_brax.config.schema import get, leaves
 from qdos_brax.errors import UserError
+from qdos_brax.report.published import Published
 from qdos_brax.runs import comparison
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import resume_command, resume_flag
@@ -111,6 +112,7 @@ class Study:
         settings: the settings, in the order in which they were given.
         reference: the setting that the others are compared with.
         notes: warnings to a reader who compares the settings, one line each.
+        published: what others published for the tasks, if the reader asked for it.
     """
 
     runs: list[Run]
@@ -118,6 +120,7 @@ class Study:
     settings: list[Setting]
     reference: Setting
     notes: list[str]
+    published: list[Published] = dataclasses.field(default_factory=list)
 
 
 def read_study(paths: Sequence[Path], reference: str | None = None) -> Study:

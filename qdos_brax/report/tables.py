@@ -54,8 +54,9 @@ class Table:
 
 
 def tables(study: Study) -> list[Table]:
-    """Return table 1, its statistics over seeds, and table 2."""
-    return [_success_table(study), _statistics_table(study), _first_goal_table(study)]
+    """Return table 1, its statistics over seeds, table 2, and what others published if that is shown."""
+    others = [_published_table(study)] if study.published else []
+    return [_success_table(study), _statistics_table(study), _first_goal_table(study), *others]
 
 
 def success_csv(study: Study) -> str:
@@ -129,6 +130,30 @@ def _first_goal_table(study: Study) -> Table:
     rows = [[setting.label, *(cell(setting, task) for task in study.tasks)] for setting in study.settings]
     note = "mean over the seeds that reached the goal; in brackets: how many did, of how many"
     return Table("Table 2. Environment steps to the first goal, mean ± std", ["method", *study.tasks], rows, note)
+
+
+def _published_table(study: Study) -> Table:
+    def count(value: int | None) -> str:
+        return _NONE if value is None else f"{value:,}"
+
+    rows = [
+        [
+            row.label,
+            row.task,
+            row.source,
+            _percent(row.before, math.nan),
+            _percent(row.success, row.std),
+            count(row.offline_steps),
+            count(row.online_steps),
+            count(row.seeds),
+            _NONE if math.isnan(row.first_goal) else f"{row.first_goal:,.0f} ± {row.first_goal_std:,.0f}",
+        ]
+        for row in study.published
+    ]
+    counts = ["offline steps", "online steps", "seeds", "first goal"]
+    header = ["method", "task", "source", "offline (%)", "success (%)", *counts]
+    note = "settings of others: their data, networks, steps and seeds; -: not said, or not measured"
+    return Table("Published by others, in settings of their own", header, rows, note, words=3)
 
 
 def _statistics(study: Study) -> list[tuple[Setting, str, list[list[float]], Estimate | None]]:

@@ -11,7 +11,7 @@ from qdos_brax.files import user_errors, write_text
 from qdos_brax.report.curves import draw_curves, draw_scans
 from qdos_brax.report.member_analysis import read_analyses
 from qdos_brax.report.page import write_page
-from qdos_brax.report.published import published_tables
+from qdos_brax.report.published import published_on
 from qdos_brax.report.static_figures import draw_static_figures
 from qdos_brax.report.study import read_study
 from qdos_brax.report.tables import Table, first_goal_csv, success_csv, tables
@@ -34,26 +34,28 @@ class Report:
     files: list[Path]
 
 
-def write_report(runs: Sequence[Path], out: Path, reference: str | None = None) -> Report:
+def write_report(runs: Sequence[Path], out: Path, reference: str | None = None, published: bool = False) -> Report:
     """Write page, tables (CSV and Markdown) and figures of runs and comparisons.
 
     Args:
         runs: folders of either kind; all must have finished. An inside.npz that cannot be read is left out and noted.
         out: the folder for the files, created if it does not exist; files of an earlier report are replaced.
         reference: the method or label that the others are compared with; None for supe if it was run, or the first.
+        published: whether to show what others published for the tasks, marked as of settings of their own.
 
     Raises:
         UserError: a folder is no finished run, or something cannot be written.
     """
     study = read_study(runs, reference)
     analyses, missing = read_analyses(study)
-    study = dataclasses.replace(study, notes=[*study.notes, *missing])
+    others = published_on(study.tasks) if published else []
+    study = dataclasses.replace(study, notes=[*study.notes, *missing], published=others)
     with user_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     if not out.is_dir():
         raise UserError(f"--out {out} is a file; give a folder for the files of the report")
     page, curves, scan = out / "report.html", out / "curves.png", out / "scan.png"
-    found = [*tables(study), *published_tables(study.tasks)]
+    found = tables(study)
     draw_curves(study, curves)
     files = [page, curves]
     if draw_scans(study, scan):

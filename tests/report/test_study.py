@@ -12,7 +12,6 @@ import pytest
 
 from qdos_brax.commands import main as commands
 from qdos_brax.report.next_step import advise
-from qdos_brax.report.published import published_tables
 from qdos_brax.report.result_sections import learning_section
 from qdos_brax.report.series import curves, scans, surfaces
 from qdos_brax.report.study import read_study
@@ -94,16 +93,6 @@ def test_tables_by_hand(tmp_path: Path) -> None:
     table2 = (tmp_path / "out" / "table2.csv").read_text().splitlines()
     assert table2[1:] == ["antmaze-medium-task1,qdos,3,3,13333.3,5773.5", "antmaze-medium-task1,supe,3,1,5000,"]
     assert {file.name for file in report.files} == {file.name for file in (tmp_path / "out").iterdir()}
-
-
-def test_the_papers_figures_stand_beside_runs_of_its_tasks(tmp_path: Path) -> None:
-    runs = [write_run(tmp_path / env, env=env) for env in ("antsoccer-arena-task1", "antmaze-large-task1")]
-    success, first_goal = published_tables(read_study(runs).tasks)
-    assert success.header == ["method", "antmaze-large-task1", "antsoccer-arena-task1"]
-    assert success.rows[-1] == ["qdos 0.3", "96 ± 6", "80 ± 10"] and success.rows[0] == ["bc", "41", "5"]
-    assert first_goal.header == ["method", "antmaze-large-task1"] and len(first_goal.rows) == 2
-    assert "Published: success (%)" in write_report(runs, tmp_path / "out").text
-    assert published_tables(["antsoccer-arena-task4", "antmaze-medium-task1"]) == []
 
 
 def test_curves_meet_the_members_in_the_middle(tmp_path: Path) -> None:
