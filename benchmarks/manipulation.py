@@ -1,10 +1,10 @@
-"""Measure the speed of the manipulation tasks: ``python benchmarks/manipulation.py [--turns 10] [--out FILE]``.
+"""Measure the speed of the manipulation tasks: ``python benchmarks/manipulation.py [TASK ..] [--turns N] [--out FILE]``.
 
-Control steps per second under random actions, resets included, of
+Control steps per second under random actions, resets included, of TASK (kitchen, cube-single, cube-double, scene)
 
-    kitchen              our 64 environments on MuJoCo C, inside jit
-    kitchen gymnasium    one FrankaKitchen-v1
-    kitchen async        FrankaKitchen-v1 in gymnasium's AsyncVectorEnv, one worker per core
+    TASK              our 64 environments on MuJoCo C, inside jit
+    TASK gymnasium    one environment of gymnasium-robotics (FrankaKitchen-v1) or OGBench (``*-singletask-v0``)
+    TASK async        the same in gymnasium's AsyncVectorEnv, one worker per core
 
 which take turns of about a second each, so that all meet the same load. The ratio is that of the medians, against the
 better of gymnasium's two.
@@ -17,6 +17,7 @@ import json
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,14 @@ def franka_kitchen() -> Any:
     gymnasium.register_envs(gymnasium_robotics)
     subtasks = ["microwave", "kettle", "bottom burner", "light switch"]
     return gymnasium.make("FrankaKitchen-v1", tasks_to_complete=subtasks)
+
+
+def ogbench(name: str) -> Any:
+    """Return OGBench's environment of the variant's default task."""
+    import gymnasium
+    import ogbench.manipspace  # noqa: F401 - registers it
+
+    return gymnasium.make(f"{name}-singletask-v0")
 
 
 def ours(task: str, batch: int, control_steps: int = 10) -> Callable[[], int]:
@@ -101,32 +110,41 @@ def rate(steps: Callable[[], int], seconds: float = SECONDS) -> float:
     return count / passed
 
 
-def kitchen(turns: int) -> dict[str, Any]:
-    """Return the median rates of the kitchen, and our ratio to the better of gymnasium's."""
+REFERENCES: dict[str, Callable[[], Any]] = {
+    "kitchen": franka_kitchen,
+    **{name: partial(ogbench, name) for name in ("cube-single", "cube-double", "scene")},
+}
+
+
+def measure(task: str, turns: int) -> dict[str, Any]:
+    """Return the median rates of a task, and our ratio to the better of gymnasium's."""
+    reference = REFERENCES[task]
     kinds = {
-        "kitchen": ours("kitchen-mixed", BATCH),
-        "kitchen gymnasium": gymnasium_single(franka_kitchen),
-        "kitchen async": gymnasium_async(franka_kitchen),
+        task: ours(task, BATCH),
+        f"{task} gymnasium": gymnasium_single(reference),
+        f"{task} async": gymnasium_async(reference),
     }
     for steps in kinds.values():
         rate(steps, 0.2)
-    rates = {name: [] for name in kinds}
+    rates: dict[str, list[float]] = {name: [] for name in kinds}
     for _ in range(turns):
         for name, steps in kinds.items():
             rates[name].append(rate(steps))
     found = {name: round(float(np.median(values)), 1) for name, values in rates.items()}
-    best = max(found["kitchen gymnasium"], found["kitchen async"])
-    return found | {"kitchen ratio": round(found["kitchen"] / best, 3), "cores": CORES, "turns": turns}
+    best = max(found[f"{task} gymnasium"], found[f"{task} async"])
+    return found | {f"{task} ratio": round(found[task] / best, 3), "cores": CORES, "turns": turns}
 
 
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(REFERENCES)} (default: all)")
     parser.add_argument("--turns", type=int, default=10, help="turns of each (default 10)")
     parser.add_argument("--out", type=Path, help="JSON file to update")
     args = parser.parse_args()
     found = json.loads(args.out.read_text()) if args.out and args.out.exists() else {}
-    found |= kitchen(args.turns)
+    for task in args.tasks or REFERENCES:
+        found |= measure(task, args.turns)
     print(json.dumps(found, indent=1))
     if args.out:
         args.out.write_text(json.dumps(found, indent=1) + "\n")
