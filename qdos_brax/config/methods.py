@@ -28,7 +28,7 @@ class Method:
         guide: the policy that acts in the first steps of an episode online, "diffusion", or None.
         actor_critic: what decides and learns online: "sac", "best-of-n" (of a flow's proposals) or "distilled-flow" (a
             one-step policy near a flow's).
-        offline: how it is learned from the data before it goes on online: "own" (by its own losses), "cal-ql" or None.
+        offline: whether the actor-critic is learned from the data, by its own losses, before it goes on online.
         policy: the flat policy that is learned from the data alone, "bc" or "iql", with no online learning; or None.
         settings: published values by dotted key.
         by_family: published values of single task families.
@@ -40,7 +40,7 @@ class Method:
     information: bool = False
     guide: str | None = None
     actor_critic: str = "sac"
-    offline: str | None = None
+    offline: bool = False
     policy: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     by_family: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -161,7 +161,7 @@ METHODS = {
         "chunks of actions: the best of N that a flow clone of the data proposes (Q-chunking, Li et al. 2025)",
         low_level="chunk",
         actor_critic="best-of-n",
-        offline="own",
+        offline=True,
         settings=_CHUNKS,
         by_family={
             family: {key: value for key, value in values.items() if key != "flow.distillation"}
@@ -173,7 +173,7 @@ METHODS = {
         "chunks of actions by flow Q-learning (QC-FQL, Li et al. 2025)",
         low_level="chunk",
         actor_critic="distilled-flow",
-        offline="own",
+        offline=True,
         settings=_CHUNKS | {"flow.distillation": 100.0},
         by_family=_FQL | {"cube": {"flow.distillation": 100.0}, "scene": {"flow.distillation": 100.0}},
     ),
@@ -181,7 +181,7 @@ METHODS = {
         "a one-step policy near a flow clone of the data, offline and on online (FQL, Park et al. 2025)",
         low_level="action",
         actor_critic="distilled-flow",
-        offline="own",
+        offline=True,
         settings=_FLAT | _CONTINUED | {"high_level.utd": 1},
         by_family=_FQL,
     ),

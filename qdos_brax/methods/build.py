@@ -129,7 +129,7 @@ def bind_phases(phases: Sequence[MemberPhase], population: Population, data: Dev
 def _continued_phases(context: BuildContext) -> list[MemberPhase]:
     """Return the phase that learns the actor-critic from the data, where the method has one."""
     config, method = context.config, context.method
-    if method.offline is None:
+    if not method.offline:
         return []
     learner = OfflineActorCritic(make_actor_critic(config, context.env), config.skills.horizon, config.flow.batch_size)
     return [offline_phase(context, AGENT, learner, config.flow.updates)]
@@ -137,7 +137,7 @@ def _continued_phases(context: BuildContext) -> list[MemberPhase]:
 
 def _warm_up(config: Config, method: Method) -> WarmUp:
     steps = config.high_level.warmup_env_steps
-    return RandomWarmUp(steps) if method.offline is None else OfflineWarmUp(steps)
+    return OfflineWarmUp(steps) if method.offline else RandomWarmUp(steps)
 
 
 class _Guide(NamedTuple):
