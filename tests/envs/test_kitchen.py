@@ -183,7 +183,7 @@ def test_an_evaluation_tells_the_share_of_the_four(env: Any, monkeypatch: pytest
     qpos, qvel = almost_done()
     qvel[24] = 0
     monkeypatch.setattr(env, "reset", lambda key: env.reset_to(qpos, qvel, key=key))
-    found = evaluate(env, lambda obs: obs[:1], lambda obs, latent: jnp.zeros(9), jax.random.key(0), 2, 2)
+    found = evaluate(env, lambda obs: obs[:1], lambda obs, latent, step: jnp.zeros(9), jax.random.key(0), 2, 2)
     assert found.score is not None and found.score.tolist() == [0.75, 0.75]
     members = type(found)(*(part[None] for part in found))
     assert summary(members)["eval/score"].tolist() == [0.75] and summary(members)["eval/success"].tolist() == [0]
