@@ -1,4 +1,4 @@
-"""Measure the speed of the manipulation tasks: ``python benchmarks/manipulation.py [TASK ..] [--turns N] [--out FILE]``.
+"""Measure the speed of the manipulation tasks: ``python benchmarks/manipulation.py [TASK ..] [--turns N] [--out F]``.
 
 Control steps per second under random actions, resets included, of TASK (kitchen, cube-single, cube-double, scene)
 
