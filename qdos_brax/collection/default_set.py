@@ -41,17 +41,17 @@ def default_dataset(
         UserError: a parameter is out of range, no expert is shipped for the body, or the folder cannot be written.
     """
     profile = profile_of(env)
-    expert = profile.expert()
+    expert, recovery = profile.expert(), profile.recovery()
     recipe = recipes.degraded(degraded_share, profile, noise)
     parameters = f"n{transitions}-bad{degraded_share:g}-noise{noise:g}-seed{seed}-envs{num_envs}"
-    version = f"{env.backend}-v{COLLECTION_VERSION}-{policies.digest(expert)}"
+    version = f"{env.backend}-v{COLLECTION_VERSION}-{policies.digest(expert, recovery)}"
     path = folder() / f"{env.spec.name}-{parameters}-{version}.hdf5"
     if path.exists():
         return path
     with locked(path):
         if not path.exists():  # another process may have made it while this one waited
             print(f"no data for {env.spec.name} yet: collecting {transitions:,} steps into {path}", flush=True)
-            make_file(path, Collector(env, recipe, expert), transitions, seed, num_envs)
+            make_file(path, Collector(env, recipe, expert, recovery), transitions, seed, num_envs)
     return path
 
 
@@ -79,23 +79,15 @@ def _attributes(collector: Collector, rows: dict[str, np.ndarray]) -> dict[str, 
     """Return the file's attributes: how the rows were collected, and what they contain."""
     env, recipe = collector.env, collector.recipe
     counts = np.bincount(rows["infos/quality"], minlength=len(QUALITY)) / len(rows["infos/quality"])
-    attributes = {
+    return {
         "env": env.spec.full_name,
         "recipe": recipe.name,
         "mix": recipes.mix_text(recipe.mix),
         "noise": recipe.noise,
         "heavy_noise": recipe.heavy_noise,
         "physics": env.backend,
-        "expert": policies.digest(collector.expert),
+        "expert": policies.digest(collector.expert, collector.recovery),
         "composition": " ".join(f"{name}={counts[code]:.3f}" for name, code in QUALITY.items()),
         "version": COLLECTION_VERSION,
         "packages": f"qdos-brax {qdos_brax.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}",
     }
-    return attributes | ({"falls": _falls(rows)} if "infos/fell" in rows else {})
-
-
-def _falls(rows: dict[str, np.ndarray]) -> str:
-    """Return "navigate=7/40 noisy=31/35": for each behaviour, how many of its episodes ended by a fall."""
-    kinds, fell = rows["infos/quality"][rows["timeouts"]], rows["infos/fell"][rows["timeouts"]]
-    counts = {name: kinds == code for name, code in QUALITY.items()}
-    return " ".join(f"{name}={(fell & chosen).sum()}/{chosen.sum()}" for name, chosen in counts.items() if chosen.any())
