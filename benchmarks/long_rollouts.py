@@ -62,14 +62,8 @@ def rollouts(env: Any, seed: int = 0) -> dict[str, np.ndarray]:
         after = state.pipeline_state
         return state, {"qpos": after.qpos, "qvel": after.qvel, "done": state.done > 0, "nan": state.metrics["nan"] > 0}
 
-    def standing(key: jax.Array, ahead: jax.Array) -> Any:
-        return env.reset_to(*profile.start(env, ahead, key), key=key)
-
     reset_keys = jax.random.split(reset_key, NUM_ENVS)
     state = jax.jit(jax.vmap(env.reset))(reset_keys)
-    if profile.has_fallen is not None:  # the task's reset drops the body, and its walker cannot get up
-        walkers = jax.jit(jax.vmap(standing))(reset_keys[:half], direction[:half])
-        state = jax.tree.map(lambda walking, other: jnp.concatenate([walking, other[half:]]), walkers, state)
     keys = jax.random.split(action_key, STEPS // NUM_ENVS)
     _, seen = jax.jit(lambda s, k: jax.lax.scan(body, s, k))(state, keys)
     start = {"qpos": state.pipeline_state.qpos[None], "qvel": state.pipeline_state.qvel[None]}

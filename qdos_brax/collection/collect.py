@@ -86,8 +86,7 @@ def collect(
 
     Returns:
         Rows in D4RL's flat layout, keyed as in the file (``infos/qpos``), with true ``next_observations``. No row is
-        terminal: episodes go on after a success and end by time, or where the body fell for good
-        (``infos/fell``, for bodies that can).
+        terminal: episodes go on after a success and end by time.
 
     Raises:
         UserError: an argument is out of range.

@@ -15,6 +15,7 @@ import numpy as np
 from envs.mazes.maze_task import MazeTask
 from envs.mazes.soccer import BALL_QPOS
 from qdos_brax.collection.experts import policies
+from qdos_brax.collection.experts.rising import Recovery
 from qdos_brax.collection.experts.steering import approach, dribble_direction, maze_direction
 from qdos_brax.collection.experts.views import random_direction
 from qdos_brax.collection.planning import Planner
@@ -34,6 +35,7 @@ class Collector:
         env: the task; its engine makes the steps. In ``antsoccer`` the target object is the ball, elsewhere the body.
         recipe: what is collected.
         expert: the body's expert (soccer: a dribbler); None loads the shipped one.
+        recovery: gets the body up; None loads the shipped one.
 
     Attributes:
         version: of the rows, raised when the same arguments give others; part of the default sets' names.
@@ -46,17 +48,23 @@ class Collector:
     version = 5
     chunk_steps = CHUNK_STEPS
 
-    def __init__(self, env: MazeTask, recipe: CollectionRecipe, expert: policies.Expert | None = None) -> None:
-        self.env, self.recipe, self.profile = env, recipe, profile_of(env)
-        self.expert = expert or self.profile.expert()
+    def __init__(
+        self,
+        env: MazeTask,
+        recipe: CollectionRecipe,
+        expert: policies.Expert | None = None,
+        recovery: Recovery | None = None,
+    ) -> None:
+        self.env, self.recipe, profile = env, recipe, profile_of(env)
+        self.expert, self.recovery = expert or profile.expert(), recovery or profile.recovery()
         self._dribbler = self.expert if isinstance(self.expert, policies.DribblingExpert) else None
         self._walker = policies.walker_of(self.expert)
         self.planner = Planner(env, recipe, self._dribbler is not None)
 
     @property
     def expert_id(self) -> str:
-        """Return eight hex digits that identify the expert's weights."""
-        return policies.digest(self.expert)
+        """Return eight hex digits that identify the weights of the expert and of what gets the body up."""
+        return policies.digest(self.expert, self.recovery)
 
     def episodes(
         self, kinds: np.ndarray, length: int, seed: int, turn: int, progress: Callable[[int], None] | None = None
@@ -88,8 +96,7 @@ class Collector:
             progress: called with the number of rows so far after every chunk.
 
         Returns:
-            rows: arrays[n * length, ..] by their name in the file. Each environment's rows are one episode, or
-                several of the same behaviour where falls ended the earlier ones.
+            rows: arrays[n * length, ..] by their name in the file. Each environment's rows are one episode.
             states: the environments after the last step.
         """
         n, chunks = len(kinds), []
@@ -104,8 +111,8 @@ class Collector:
     def _file_arrays(self, chunks: list[Row], kinds: np.ndarray) -> dict[str, np.ndarray]:
         """Join chunks[.., n, CHUNK_STEPS, ...] along time and name the arrays as in the file."""
         steps = Row(*(np.concatenate(part, axis=1) for part in zip(*chunks, strict=True)))
-        n, length = steps.fell.shape
-        ends = steps.fell.copy()
+        n, length = steps.action.shape[:2]
+        ends = np.zeros((n, length), bool)
         ends[:, -1] = True
         rows = {
             "observations": steps.observation,
@@ -116,8 +123,6 @@ class Collector:
             "infos/qvel": steps.qvel,
             "infos/quality": np.repeat(kinds[:, None], length, axis=1),
         }
-        if self.profile.has_fallen is not None:
-            rows["infos/fell"] = steps.fell
         return {name: value.reshape(n * length, *value.shape[2:]) for name, value in rows.items()}
 
     @partial(jax.jit, static_argnums=0)
@@ -133,22 +138,16 @@ class Collector:
     def chunk(self, states: RolloutState, kinds: jax.Array, keys: jax.Array) -> tuple[RolloutState, Row]:
         """Step every environment CHUNK_STEPS times; return (states, rows[n, CHUNK_STEPS, ...]).
 
-        An environment whose body falls goes on from a start that is drawn once a chunk, for an engine call after
-        every fall would slow all environments down. A body that falls twice within a chunk, which takes about a
-        second, starts from the same state again.
-
         Args:
             states: n environments.
             kinds: int8[n], the behaviour in each.
             keys: random keys[n].
         """
-        split = jax.vmap(lambda key: jax.random.split(key, CHUNK_STEPS + 1), out_axes=1)(keys)
-        draws = jax.vmap(jax.vmap(self.planner.draw))(split[:-1])
-        starts = None if self.profile.has_fallen is None else jax.vmap(self._reset_one)(split[-1])
+        split = jax.vmap(lambda key: jax.random.split(key, CHUNK_STEPS), out_axes=1)(keys)
+        draws = jax.vmap(jax.vmap(self.planner.draw))(split)
 
         def step(states: RolloutState, draws: Draws) -> tuple[RolloutState, Row]:
-            states, row = jax.vmap(self._step_one)(states, kinds, draws)
-            return _restarted(states, starts, row.fell), row
+            return jax.vmap(self._step_one)(states, kinds, draws)
 
         states, rows = jax.lax.scan(step, states, draws)
         return states, jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), rows)
@@ -161,15 +160,15 @@ class Collector:
             ball_xy, has_ball = self.planner.ball_start(ball_key, body)
             target_object = jnp.where(has_ball, ball_xy, body)
         goal_xy = self.planner.first_goal(goal_key, target_object)
-        ahead = maze_direction(self.planner.navigator, body, goal_xy)
-        qpos, qvel = self.profile.start(self.env, ahead, reset_key)
-        qpos = qpos.at[:2].set(body)
+        start = self.env.reset(reset_key).pipeline_state
+        qpos = start.qpos.at[:2].set(body)
         if self._dribbler is not None:
             qpos = qpos.at[BALL_QPOS : BALL_QPOS + 2].set(ball_xy)
-        pipeline = self.env.engine.init(qpos, qvel)
+        pipeline = self.env.engine.init(qpos, start.qvel)
         return RolloutState(
             pipeline=pipeline,
             observation=self.env.observe(pipeline),
+            memory=self.recovery.begin(),
             has_ball=has_ball,
             goal_xy=goal_xy,
             origin_xy=target_object,
@@ -188,16 +187,16 @@ class Collector:
         """Make one control step in one environment."""
         state = self.planner.plan(state, kind, draws)
         qpos, qvel = state.pipeline.qpos, state.pipeline.qvel
-        action = self._action(state, kind)
         sigma = jnp.where(kind == QUALITY["noisy"], self.recipe.heavy_noise, self.recipe.noise)
-        action = jnp.clip(action + sigma * draws.noise, -1.0, 1.0)
+        action = jnp.clip(self._action(state, kind) + sigma * draws.noise, -1.0, 1.0)
+        memory = self.recovery.follow(state.memory, qpos, qvel)
+        action = self.recovery.act(memory, qpos, qvel, action)
         pipeline = self.env.engine.step(state.pipeline, action)
         after = self.env.observe(pipeline)
-        has_fallen = self.profile.has_fallen
-        fell = jnp.zeros((), bool) if has_fallen is None else has_fallen(pipeline.qpos)
-        row = Row(qpos, qvel, state.observation, action, after, fell)
+        row = Row(qpos, qvel, state.observation, action, after)
         state = state.replace(
             pipeline=self.env.teleport(pipeline, draws.teleport),
+            memory=memory,
             observation=after,  # still at the entrance, as the task's own step shows it
             attempt_steps=state.attempt_steps + 1,
             episode_steps=state.episode_steps + 1,
@@ -224,12 +223,3 @@ class Collector:
         dribbles = state.has_ball & near & (state.escape_steps == 0) & (kind != QUALITY["wander"])
         push = dribble_direction(navigator, target_object, target)
         return jnp.where(dribbles, self._dribbler.act(pipeline.qpos, pipeline.qvel, push), action)
-
-
-def _restarted(states: RolloutState, starts: RolloutState | None, fell: jax.Array) -> RolloutState:
-    """Replace the environments where ``fell[n]`` by ``starts``, keeping their arrivals; None: no body stays down."""
-    if starts is None:
-        return states
-    starts = starts.replace(arrivals=states.arrivals)
-    choose = jax.vmap(jnp.where)  # by environment
-    return jax.tree.map(lambda new, old: choose(fell, new, old), starts, states)

@@ -76,7 +76,7 @@ def _attributes(collector: EpisodeCollector, rows: dict[str, np.ndarray]) -> dic
     """Return the file's attributes: how the rows were collected, and what they contain."""
     env, recipe = collector.env, collector.recipe
     counts = np.bincount(rows["infos/quality"], minlength=len(QUALITY)) / len(rows["infos/quality"])
-    attributes = {
+    return {
         "env": env.spec.full_name,
         "recipe": recipe.name,
         "mix": recipes.mix_text(recipe.mix),
@@ -88,11 +88,3 @@ def _attributes(collector: EpisodeCollector, rows: dict[str, np.ndarray]) -> dic
         "version": collector.version,
         "packages": f"qdos-brax {qdos_brax.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}",
     }
-    return attributes | ({"falls": _falls(rows)} if "infos/fell" in rows else {})
-
-
-def _falls(rows: dict[str, np.ndarray]) -> str:
-    """Return "navigate=7/40 noisy=31/35": for each behaviour, how many of its episodes ended by a fall."""
-    kinds, fell = rows["infos/quality"][rows["timeouts"]], rows["infos/fell"][rows["timeouts"]]
-    counts = {name: kinds == code for name, code in QUALITY.items()}
-    return " ".join(f"{name}={(fell & chosen).sum()}/{chosen.sum()}" for name, chosen in counts.items() if chosen.any())

@@ -16,7 +16,6 @@ class Row(NamedTuple):
     Attributes:
         qpos, qvel, observation, action: before the step.
         next_observation: after the step.
-        fell: bool, the body fell for good in this step; the next row belongs to another episode.
     """
 
     qpos: Any
@@ -24,7 +23,6 @@ class Row(NamedTuple):
     observation: Any
     action: Any
     next_observation: Any
-    fell: Any
 
 
 class Draws(NamedTuple):
@@ -56,6 +54,7 @@ class RolloutState(struct.PyTreeNode):
     Attributes:
         pipeline: the simulator's state.
         observation: float32[obs], the task's observation.
+        memory: int32[m], what the recovery remembers.
         has_ball: bool, whether the target object is the ball.
         goal_xy, origin_xy: float32[2], the target object's goal, and its position when that goal was drawn.
         returning: bool, a failing attempt is on its way back to the origin.
@@ -70,6 +69,7 @@ class RolloutState(struct.PyTreeNode):
 
     pipeline: PipelineState
     observation: jax.Array
+    memory: jax.Array
     has_ball: jax.Array
     goal_xy: jax.Array
     origin_xy: jax.Array

@@ -40,7 +40,6 @@ _OVERRIDE = 1.5  # weight of the learned heading, enough to turn to any directio
 # The humanoid's angular velocities reach 10 rad/s and more.
 _SPIN_SCALE = 0.25  # of the root
 _SWING_SCALE = 0.1  # of the joints
-_RISING_SPAN = 2.0  # rad
 
 MAX_TURN = 0.7
 """Largest angle between a humanoid's facing direction and its command, rad: sharper turns make it fall more often."""
@@ -138,11 +137,6 @@ def humanoid_torques(qpos: jax.Array, joint_targets: jax.Array) -> jax.Array:
     return jnp.clip(joint_targets - angles, -1.0, 1.0)
 
 
-def rising_torques(qpos: jax.Array, action: jax.Array) -> jax.Array:
-    """Return torques[..., 21] for ``action[..., 21]`` of a body that gets up: targets as far off as crouching needs."""
-    return humanoid_torques(qpos, _RISING_SPAN * action)
-
-
 def dribbler_view(qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> jax.Array:
     """Return a dribbler's observation[..., 35]: the ant and the ball."""
     body = body_view(qpos[..., :ANT_NQ], qvel[..., :ANT_NV], direction)
@@ -217,9 +211,19 @@ def ant_dribbler(path: Path | None = None) -> Dribbler:
     return Dribbler(read_actor(path or shipped("ant_dribbler")), ant_walker())
 
 
-def digest(expert: Expert) -> str:
-    """Return eight hex digits that identify an expert's weights."""
+class Trained(Protocol):
+    """Define what was trained.
+
+    Attributes:
+        params: the arrays that distinguish one from another.
+    """
+
+    params: Any
+
+
+def digest(*trained: Trained) -> str:
+    """Return eight hex digits that identify the weights of an expert, and of what goes with it."""
     sha = hashlib.sha256()
-    for leaf in jax.tree.leaves(expert.params):
+    for leaf in jax.tree.leaves([part.params for part in trained]):
         sha.update(np.asarray(leaf).tobytes())
     return sha.hexdigest()[:8]

@@ -106,7 +106,7 @@ def test_weights_come_back_as_they_were_written(tmp_path: Path) -> None:
         policies.ant_walker(tmp_path / "none.npz")
 
 
-@pytest.mark.parametrize("name", ["ant_walker", "ant_dribbler", "humanoid_walker"])
+@pytest.mark.parametrize("name", ["ant_walker", "ant_dribbler", "humanoid_walker", "humanoid_riser"])
 def test_shipped_weights_are_small_and_say_where_they_come_from(name: str) -> None:
     path = weights.shipped(name)
     assert path.stat().st_size < 5_000_000

@@ -15,7 +15,7 @@ from qdos_brax.collection.experts.tasks import TASKS, HumanoidRising, HumanoidWa
 from qdos_brax.collection.experts.tasks.base import EnvState, StepResult
 from qdos_brax.collection.experts.train import Training, read_learner
 from qdos_brax.collection.experts.trainer import Sizes, Trainer
-from qdos_brax.collection.experts.views import random_direction, to_direction_frame, to_world_frame
+from qdos_brax.collection.experts.views import forward_axis, random_direction, to_direction_frame, to_world_frame
 from qdos_brax.data.transitions import Transition
 from qdos_brax.errors import UserError
 
@@ -157,18 +157,18 @@ def test_rewards_of_the_humanoid_by_hand() -> None:
     assert not task.evaluate_step(before, jnp.zeros(21), state.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
 
 
-def test_rewards_of_rising_by_hand() -> None:
+def test_rising_begins_in_a_crouch_or_on_its_feet_and_ends_where_it_sits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(HumanoidRising, "CROUCHES", 8)
     task = HumanoidRising()
-    state = task.reset(jax.random.key(0))
-    up = state.pipeline.qpos.at[2].set(1.2).at[3:7].set(jnp.array([1.0, 0, 0, 0]))
-    after = state.pipeline.replace(qpos=up, qvel=jnp.zeros(27).at[0].set(0.5))
-    result = task.evaluate_step(state, jnp.full(21, 0.5), after)
-    np.testing.assert_allclose(result.reward, 1.5 * 1.2 / 1.29 + np.exp(-0.25) - 0.1 * 0.25, atol=1e-5)
-    half = jnp.sqrt(0.5)
-    lying = state.pipeline.replace(qpos=up.at[2].set(0.129).at[3:7].set(jnp.array([half, half, 0, 0])))
-    result = task.evaluate_step(state, jnp.zeros(21), lying)
-    np.testing.assert_allclose(result.reward, 0.1, atol=1e-5)
-    assert result.alive and not result.truncated
+    state = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.key(0), 64))
+    stands = np.asarray(state.pipeline.qpos[:, 2] > 1.2)
+    assert 0.02 < stands.mean() < 0.4  # 0.15 of them
+    ahead = forward_axis(state.pipeline.qpos)[:, :2]
+    np.testing.assert_allclose(state.direction, ahead / jnp.linalg.norm(ahead, axis=1, keepdims=True), atol=1e-5)
+    first = jax.tree.map(lambda leaf: leaf[0], state)
+    crouching = first.pipeline.replace(qpos=first.pipeline.qpos.at[2].set(0.5).at[3:7].set(jnp.array([1.0, 0, 0, 0])))
+    assert task.evaluate_step(first, jnp.zeros(21), crouching).alive
+    assert not task.evaluate_step(first, jnp.zeros(21), crouching.replace(qpos=crouching.qpos.at[2].set(0.4))).alive
 
 
 def test_a_mirrored_humanoid_moves_as_its_image() -> None:

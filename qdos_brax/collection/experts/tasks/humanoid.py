@@ -6,20 +6,19 @@ import jax
 import jax.numpy as jnp
 
 from envs.mazes import models
-from envs.mazes.locomotion import dropped_humanoid, dropped_poses
 from envs.physics.base import PipelineState
 from envs.physics.mujoco.engine import MujocoEngine
-from qdos_brax.collection.experts import policies, symmetry
-from qdos_brax.collection.experts.poses import STANDING, humanoid_is_up, standing_humanoid
+from qdos_brax.collection.experts import falls, policies, rising, symmetry
+from qdos_brax.collection.experts.poses import humanoid_is_up, standing_humanoid
 from qdos_brax.collection.experts.tasks.base import EnvState, StepResult
 from qdos_brax.collection.experts.views import (
     direction_of,
     forward_axis,
-    random_direction,
     to_direction_frame,
     uprightness,
 )
 from qdos_brax.data.transitions import Transition
+from qdos_brax.nn.vectors import unit_vector
 
 
 class HumanoidWalking:
@@ -71,65 +70,53 @@ class HumanoidWalking:
             - 0.1 * jnp.mean(torques**2)
         )
         measures = {"speed": velocity[0], "facing": facing}
-        return StepResult(reward, humanoid_is_up(after.qpos), jnp.zeros((), bool), measures)
+        return StepResult(reward, self.is_up(after.qpos), jnp.zeros((), bool), measures)
+
+    def is_up(self, qpos: jax.Array) -> jax.Array:
+        """Return bool[...]: the body has not fallen."""
+        return humanoid_is_up(qpos)
 
     def mirror(self, batch: Transition) -> Transition:
         """Exchange left and right: the body and the reward are symmetric."""
         return _mirrored(batch)
 
 
-class HumanoidRising:
-    """Reward getting up from wherever the body fell, and standing.
+class HumanoidRising(HumanoidWalking):
+    """Reward walking likewise, from the crouches in which the motions of ``experts.rising`` leave a body that fell.
 
-    Reward per control step: the torso's height as a share of the standing height, and half as much again for being
-    upright there; 1 while it is up, reduced by how fast it moves; minus a term for effort. An episode begins as in
-    OGBench's resets, dropped in a random pose, or (a share STANDING_SHARE of them) on its feet with a push; it never
-    ends early, so that lying costs reward.
+    The body is to walk where it faces. STANDING_SHARE of the episodes begin on their feet. An episode ends where the
+    body sits or lies.
     """
 
     name = "humanoid_riser"
-    observation_dim, action_dim = 55, 21
-    discount, episode_steps, direction_steps, action_noise = 0.99, 300, 10**9, 0.0
+    episode_steps, direction_steps = 120, 10**9
 
-    STANDING_SHARE = 0.25
-    PUSH = 0.5  # standard deviation of the velocities of a standing start, m/s and rad/s
+    STANDING_SHARE = 0.15
+    CROUCHES = 256  # drawn once; half of them shaken, with up to ``action_noise``
+    LOWEST = 0.45  # height of the torso of a body that still crouches, m
 
     def __init__(self) -> None:
-        self.engine = MujocoEngine(models.humanoid_model(), threads=1)
-        self._poses = dropped_poses()
+        super().__init__()
+        drop_key, noise_key = jax.random.split(jax.random.key(0))
+        state = falls.dropped(self.engine, drop_key, self.CROUCHES)
+        noise = jnp.maximum(jnp.linspace(-self.action_noise, self.action_noise, self.CROUCHES), 0.0)[:, None]
+        motions = rising.humanoid_motions()
+        self._crouches = falls.arrivals(self.engine, rising.RISES, motions, state, noise, noise_key)
 
     def reset(self, key: jax.Array) -> EnvState:
-        """Draw a dropped or a standing body, as described in the class; the direction does not matter."""
-        kind_key, drop_key, pose_key, qvel_key, direction_key = jax.random.split(key, 5)
+        """Draw a crouching or a standing body, and its facing direction."""
+        kind_key, crouch_key, stand_key = jax.random.split(key, 3)
+        standing = super().reset(stand_key).pipeline
+        crouches = self._crouches
+        index = jax.random.categorical(crouch_key, jnp.where(crouches.arrived, 0.0, -jnp.inf))
         stands = jax.random.bernoulli(kind_key, self.STANDING_SHARE)
-        dropped = jnp.concatenate([jnp.zeros(2), dropped_humanoid(drop_key, self._poses)])
-        direction = random_direction(direction_key)
-        standing, _ = standing_humanoid(pose_key, jnp.arctan2(direction[1], direction[0]))
-        qvel = jnp.where(stands, self.PUSH, 0.1) * jax.random.normal(qvel_key, (self.engine.nv,))
-        pipeline = self.engine.init(jnp.where(stands, standing, dropped), qvel)
-        return EnvState(pipeline, direction, jnp.zeros((), jnp.int32))
+        qpos = jnp.where(stands, standing.qpos, crouches.qpos[index])
+        qvel = jnp.where(stands, standing.qvel, crouches.qvel[index])
+        return EnvState(self.engine.init(qpos, qvel), unit_vector(forward_axis(qpos)[:2]), jnp.zeros((), jnp.int32))
 
-    def observe(self, state: EnvState) -> jax.Array:
-        """Return the body's view, float[55]."""
-        return policies.humanoid_view(state.pipeline.qpos, state.pipeline.qvel, state.direction)
-
-    def torques(self, state: EnvState, action: jax.Array) -> jax.Array:
-        """Return float[21] that pull the joints to the targets in ``action``, scaled to the range of crouching."""
-        return policies.rising_torques(state.pipeline.qpos, action)
-
-    def evaluate_step(self, before: EnvState, torques: jax.Array, after: PipelineState) -> StepResult:
-        """Compute the reward given in the class; never end the episode."""
-        height = jnp.clip(after.qpos[2] / STANDING, 0.0, 1.0)
-        is_up = humanoid_is_up(after.qpos)
-        calm = jnp.exp(-jnp.sum(after.qvel[:2] ** 2))
-        effort = jnp.mean(torques**2)
-        reward = height + 0.5 * height * jnp.maximum(uprightness(after.qpos), 0.0) + is_up * calm - 0.1 * effort
-        ends = jnp.zeros((), bool)
-        return StepResult(reward, ~ends, ends, {"height": after.qpos[2], "up": is_up.astype(jnp.float32)})
-
-    def mirror(self, batch: Transition) -> Transition:
-        """Exchange left and right: the body and the reward are symmetric."""
-        return _mirrored(batch)
+    def is_up(self, qpos: jax.Array) -> jax.Array:
+        """Return bool[...]: the body crouches or stands."""
+        return (qpos[..., 2] > self.LOWEST) & (uprightness(qpos) > 0.3)
 
 
 def _mirrored(batch: Transition) -> Transition:

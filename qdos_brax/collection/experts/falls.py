@@ -1,0 +1,72 @@
+"""Bodies that fell: dropped as the humanoid's task drops them, and where a stage of getting up begins."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.mazes.locomotion import dropped_humanoid, dropped_poses
+from envs.physics.base import Engine, PipelineState
+from qdos_brax.collection.experts.rising import LIES, Motions, motion_torques, next_stage
+
+STEPS = 240
+"""Control steps within which a dropped body lies, turns if it has to, and crouches."""
+
+
+class Arrivals(NamedTuple):
+    """Hold where n bodies were when they began a stage.
+
+    Attributes:
+        qpos: float32[n, 28].
+        qvel: float32[n, 27].
+        arrived: bool[n], False where the stage was not reached; qpos and qvel are then those of the start.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    arrived: jax.Array
+
+
+def dropped(engine: Engine, key: jax.Array, count: int) -> PipelineState:
+    """Draw ``count`` humanoids as the task's reset drops them, at the origin of an open floor."""
+    pose_key, qvel_key = jax.random.split(key)
+    poses = dropped_poses()
+    rest = jax.vmap(lambda key: dropped_humanoid(key, poses))(jax.random.split(pose_key, count))
+    qpos = jnp.concatenate([jnp.zeros((count, 2)), rest], axis=1)
+    return jax.vmap(engine.init)(qpos, 0.1 * jax.random.normal(qvel_key, (count, engine.nv)))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def arrivals(
+    engine: Engine, stage: int, motions: Motions, state: PipelineState, noise: jax.Array, key: jax.Array
+) -> Arrivals:
+    """Simulate STEPS control steps of n bodies that fall and get up; return where each first began ``stage``.
+
+    Args:
+        engine: the physics.
+        stage: one of ``rising``'s stages.
+        motions: the motions.
+        state: n states.
+        noise: float[n, 1], standard deviation of the noise on the torques.
+        key: random key of the noise.
+    """
+
+    def step(carry: tuple[PipelineState, jax.Array, Arrivals], key: jax.Array) -> tuple[tuple, None]:
+        state, memory, first = carry
+        memory = jax.vmap(partial(next_stage, motions))(memory, state.qpos, state.qvel)
+        arrives = (memory[:, 0] == stage) & ~first.arrived
+        qpos, qvel = (
+            jnp.where(arrives[:, None], now, before)
+            for now, before in ((state.qpos, first.qpos), (state.qvel, first.qvel))
+        )
+        torques = jax.vmap(partial(motion_torques, motions))(memory, state.qpos, state.qvel)
+        torques = jnp.clip(torques + noise * jax.random.normal(key, torques.shape), -1.0, 1.0)
+        state = jax.vmap(engine.step)(state, torques)
+        return (state, memory, Arrivals(qpos, qvel, first.arrived | arrives)), None
+
+    memory = jnp.tile(jnp.array([LIES, 0], jnp.int32), (state.qpos.shape[0], 1))
+    none = Arrivals(state.qpos, state.qvel, jnp.zeros(state.qpos.shape[0], bool))
+    return jax.lax.scan(step, (state, memory, none), jax.random.split(key, STEPS))[0][2]
