@@ -17,7 +17,6 @@ from qdos_brax.collection.experts.poses import humanoid_is_up
 from qdos_brax.collection.experts.rising import CROUCHES, LIES, RISES, TURNS, WALKS, Motion, Motions
 from qdos_brax.collection.experts.symmetry import HUMANOID_ACTUATED, mirrored_action
 from qdos_brax.collection.experts.views import random_direction
-from qdos_brax.collection.profiles import MAZE_TURN
 from qdos_brax.errors import UserError
 
 HALF = float(np.sqrt(0.5))
@@ -114,7 +113,7 @@ def test_bodies_dropped_as_the_task_drops_them_end_in_a_crouch() -> None:
 def test_a_dropped_humanoid_gets_up_and_walks_on() -> None:
     """256 of the task's own resets, 20 s each without noise, then along a direction of their own."""
     episodes, steps = 256, 800
-    engine, walker = MujocoEngine(models.humanoid_model()), policies.humanoid_walker(max_turn=MAZE_TURN)
+    engine, walker = MujocoEngine(models.humanoid_model()), policies.humanoid_walker(max_turn=1.0)
     recovery = rising.humanoid_rising()
     drop_key, direction_key = jax.random.split(jax.random.key(11))
     state = falls.dropped(engine, drop_key, episodes)
