@@ -40,9 +40,7 @@ from qdos_brax.offline.offline_phase import Evaluation, OfflinePhase
 from qdos_brax.population import memory
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
-from qdos_brax.skills.low_level import (
-    LowLevelPolicy,
-)
+from qdos_brax.skills.low_level import LowLevelPolicy
 from qdos_brax.skills.values import IQL
 
 
