@@ -97,7 +97,9 @@ def test_data_labels_and_data_check_count_the_same(
 @pytest.mark.parametrize("horizon", [1, 5])
 def test_evaluation_and_first_goals_count_the_same(played: Any, horizon: int) -> None:
     env, states = played
-    play = partial(evaluate, env, lambda obs: jnp.zeros(1), lambda obs, z: jnp.zeros(8), jax.random.key(0), 1, horizon)
+    play = partial(
+        evaluate, env, lambda obs: jnp.zeros(1), lambda obs, z, t: jnp.zeros(8), jax.random.key(0), 1, horizon
+    )
     episodes = jax.jit(play)()
     counts = env._left > 1
     assert float(episodes.success[0]) == counts and int(episodes.length[0]) == len(states) - 1

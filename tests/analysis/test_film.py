@@ -107,17 +107,17 @@ def test_a_small_film_is_what_was_drawn() -> None:
 
 @pytest.mark.usefixtures("opengl")
 def test_an_episode_in_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 201 states, 20 s: eighty frames that play for 8 s, six of which are pictures; the camera goes along."""
+    """Of 201 states, 20 s: 48 frames that play for 6 s, six of which are pictures; the camera goes along."""
     monkeypatch.setattr(pictures, "_HEIGHT", 48)
     monkeypatch.setattr(pictures, "_WIDTH", 64)
     env = envs.make("antmaze-medium", physics="mujoco")
     qpos = np.tile(np.asarray(env.engine.model.qpos0), (201, 1))
     qpos[:, 0] = np.linspace(0, 4, 201)  # along the first corridor
     found = pictures.draw_episode(env, qpos, np.tile(np.asarray(env.goal_xy), (201, 1)))
-    assert found["film_speed"] == pytest.approx(2.5)
+    assert found["film_speed"] == pytest.approx(20 / 6)
     assert found["frame_steps"][0] == 0 and found["frame_steps"][-1] == 200 and len(found["frame_steps"]) == 6
     with PIL.Image.open(io.BytesIO(found["film"].tobytes())) as film:
-        assert film.n_frames == 80 and film.size == (64, 48)
+        assert film.n_frames == 48 and film.size == (64, 48)
     for frame in found["frames"].astype(int):  # the ant's brown in the middle
         assert frame[24, 32, 0] > 130 and frame[24, 32, 0] > frame[24, 32, 2] + 50
     monkeypatch.setenv("MUJOCO_GL", "off")

@@ -30,7 +30,7 @@ def test_bash_completes_commands_and_flags(tmp_path: Path, capsys: pytest.Captur
     for typed, proposed in (
         (["tr"], "train"),
         (["train", "--pre"], "--preset --pretrain-steps"),
-        (["data", ""], "make fetch info check"),
+        (["data", ""], "make fetch info check export"),
         (["completion", ""], "bash zsh tcsh"),
     ):
         asked = subprocess.run(

@@ -77,9 +77,9 @@ def test_too_few_rows_name_the_longest_episode() -> None:
     assert "no episode has 5 steps, the length of a segment (longest 4): use --set skills.horizon=N" in line
     for what in ("one segment", "and one row more"):
         assert unmet(lacking(what), PointEnv(), config_of("qdos")) == []
-    for method in METHODS:  # a method without skills takes single transitions
+    for method in METHODS:  # those without skills take single transitions, or shorter chunks of actions
         met = unmet(lacking("a row less"), PointEnv(), config_of(method)) == []
-        assert met == (config_of(method).skills.horizon == 1)
+        assert met == (config_of(method).skills.horizon <= 4)
 
 
 def test_rollouts_need_the_whole_state() -> None:

@@ -114,7 +114,7 @@ class ScoredLine(Line):
 def test_a_score_is_that_of_the_episodes_end(goal, score):
     """Also where the last macro step reaches beyond it: 20 steps are three macro steps of 6, and two more."""
     env = ScoredLine(goal=goal, cap=20)
-    episodes = evaluate(env, lambda obs: jnp.ones(1), lambda obs, z: z, jax.random.key(0), episodes=2, horizon=6)
+    episodes = evaluate(env, lambda obs: jnp.ones(1), lambda obs, z, step: z, jax.random.key(0), episodes=2, horizon=6)
     np.testing.assert_array_equal(episodes.score, [score] * 2)
     of_members = Episodes(*(x[None] for x in episodes))
     assert summary(of_members)["eval/score"].tolist() == [score]
