@@ -106,12 +106,15 @@ class Task(Env, ABC):
         jump: distance that the first two numbers of an observation, a position then, never move in one control step;
             None where they are no position. Readers of data files find unmarked ends of episodes by it.
         body_frame: which numbers of an observation move and turn with the body.
+        metric_names: what ``state.metrics`` holds: "success", and "score" (the share of the task that is done) for a
+            task that has parts.
         unfit: why known files of the same scene cannot be used, by their numbers per observation.
     """
 
     distance_margin = 0.0
     jump: float | None = None
     body_frame: BodyFrame | None = None
+    metric_names: tuple[str, ...] = ("success",)
     unfit: Mapping[int, str] = MappingProxyType({})
 
     def __init__(self, spec: TaskSpec, engine: Engine, goal: Any = ()) -> None:
@@ -177,7 +180,8 @@ class Task(Env, ABC):
             "final_obs": obs,
             "reset_key": jax.random.key(0) if key is None else key,
         }
-        return State(pipeline_state, obs, jnp.zeros(()), jnp.zeros(()), {"success": jnp.zeros(())}, info)
+        metrics = {name: jnp.zeros(()) for name in self.metric_names}
+        return State(pipeline_state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
     def start_physics(
         self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None, key: jax.Array | None

@@ -47,6 +47,7 @@ class Kitchen(Task):
     """
 
     distance_margin = 0.5
+    metric_names = ("success", "score")
     unfit = MappingProxyType(
         {60: "D4RL's kitchen: 30 positions and the goal, neither velocities nor simulator states; use data make"}
     )
@@ -61,21 +62,6 @@ class Kitchen(Task):
     def reset(self, rng: jax.Array) -> State:
         """Return the start, which is always the same but for the sensors' errors."""
         return self.reset_to(jnp.asarray(START_QPOS), jnp.zeros(self.engine.nv), key=rng)
-
-    def reset_to(
-        self,
-        qpos: jax.Array,
-        qvel: jax.Array,
-        goal: Any = None,
-        key: jax.Array | None = None,
-        extra: jax.Array | None = None,
-    ) -> State:
-        """Return any simulator state as the first of an episode; the sensors' errors are drawn from ``key``.
-
-        Args and results are those of ``Task.reset_to``.
-        """
-        state = super().reset_to(qpos, qvel, goal, key, extra)
-        return state.replace(metrics=state.metrics | {"score": jnp.zeros(())})
 
     def start_physics(
         self, qpos: jax.Array, qvel: jax.Array, extra: jax.Array | None, key: jax.Array | None

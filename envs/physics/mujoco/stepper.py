@@ -119,9 +119,9 @@ class BatchStepper:
         return BatchStep(rows, extra, sensed)
 
     def _fresh_qpos(self, qpos: np.ndarray) -> np.ndarray:
-        """Return the float64[n, nq] that fresh states at ``qpos`` (float32[n, nq]) start from."""
+        """Return where fresh states at ``qpos`` (float32[n, nq]) start: there, or at the float64 that it stands for."""
         if self._exact_qpos is None:
-            return qpos.astype(np.float64)
+            return qpos
         there = (self._exact_qpos.astype(np.float32) == qpos).all(axis=1, keepdims=True)
         return np.where(there, self._exact_qpos, qpos)
 
