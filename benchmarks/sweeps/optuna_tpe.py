@@ -17,7 +17,6 @@ leaves pruned trials out if only folders with a summary.json are given.
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import shlex
@@ -29,8 +28,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from benchmarks.sweeps.ray_tune import Run, check, same_as_before, searched, settings
-from qdos_brax.commands.arguments import Parser, positive
+from benchmarks.sweeps.ray_tune import Run, check, same_as_before, searched, settings, sweep_parser
+from qdos_brax.commands.arguments import positive
 from qdos_brax.errors import UserError
 
 Space = Mapping[str, tuple[str, float, float] | list[str]]
@@ -39,15 +38,7 @@ _FOLDER, _STOPPED = "folder", "stopped"  # Optuna's attributes of a trial: of it
 
 def main() -> int:
     """Run the command line; return 0 if all trials ended."""
-    parser = Parser(prog="optuna_tpe.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the sweep")
-    parser.add_argument(
-        "--set",
-        metavar="KEY=VALUES",
-        action="append",
-        required=True,
-        help="a key of the configuration that Optuna chooses: a list, uniform(a,b) or loguniform(a,b)",
-    )
+    parser = sweep_parser("optuna_tpe.py", __doc__, "Optuna chooses: a list, uniform(a,b) or loguniform(a,b)")
     parser.add_argument("--trials", metavar="N", type=positive, default=20, help="how many (default 20)")
     parser.add_argument("--startup", metavar="N", type=positive, default=5, help="trials that none is pruned before")
     parser.add_argument(

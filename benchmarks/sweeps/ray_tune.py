@@ -160,17 +160,19 @@ def check(flags: Sequence[str], space: Mapping[str, tuple[str, float, float] | l
                 raise UserError("a trial is one program; give one method, and lists of sizes with this script's --set")
 
 
+def sweep_parser(prog: str, description: str | None, chosen: str) -> Parser:
+    """Return a parser of what every sweep is told; ``chosen`` says who chooses the keys of --set, and from what."""
+    parser = Parser(prog=prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the sweep")
+    help_text = f"a key of the configuration that {chosen}"
+    parser.add_argument("--set", metavar="KEY=VALUES", action="append", required=True, help=help_text)
+    return parser
+
+
 def main() -> int:
     """Run the command line; return 0 if all trials finished."""
-    parser = Parser(prog="ray_tune.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the sweep")
-    parser.add_argument(
-        "--set",
-        metavar="KEY=VALUES",
-        action="append",
-        required=True,
-        help="a key of the configuration that Ray chooses: a list, each value tried, or uniform(a,b), loguniform(a,b)",
-    )
+    chosen = "Ray chooses: a list, each value tried, or uniform(a,b), loguniform(a,b)"
+    parser = sweep_parser("ray_tune.py", __doc__, chosen)
     parser.add_argument(
         "--samples", metavar="N", type=positive, default=1, help="draws per combination of the lists (default 1)"
     )
