@@ -1,13 +1,19 @@
 """Measure the ceiling of a skill space, without RL: ``python benchmarks/skills.py RUN [RUN ..] --out FILE``.
 
-Asks the simulator's truth, which training never sees, of the first member of each setting of a finished run:
+Plays draws from the skill prior in the simulator, of the first member of each setting of a finished run:
 
-- from logged states, with draws from the skill prior each: the true progress of a macro step (decrease of the shortest
-  path to the goal) in mean and of the best draw, and how far the end points lie from their mean;
-- R2 of the latent, as a linear map of the start's observation alone, and of that and where the body got, as seen from
-  its start: the second beyond the first is what z says about what happens;
-- the share of states at a wall, less than WALL away, from which a draw gets more than AWAY away;
-- the oracle: success and steps of episodes in which the draw of most true progress is played.
+- from logged states, some draws each: progress of a macro step in mean and of the best draw, and how far the outcomes
+  lie from their mean;
+- R2 of the latent, as a linear map of the start's observation alone, and of that and the outcome: the second beyond the
+  first is what z says about what happens;
+- the share of states in which a skill has to get at something and a draw does: in mazes states at a wall, less than
+  WALL away, from which a draw gets more than AWAY away; for an arm all states, where a draw moves a thing by MOVED;
+- random skills, one after the other: success and best score of whole episodes;
+- the oracle: success, score and steps of episodes in which the draw of most progress is played.
+
+In mazes progress is the true decrease of the shortest path to the goal, which training never sees, and an outcome is
+where the body got, as seen from its start. An arm has no such truth: progress is the decrease of the cost to go of the
+nearest logged states on the graph that weighs segments too, and an outcome is the change of its features.
 
 Prints a table and writes CSV.
 """
@@ -17,24 +23,34 @@ from __future__ import annotations
 import argparse
 import csv
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
+from envs.brax_base import State
+from envs.manipulation.kitchen_rig import JOINTS
+from envs.manipulation.manipspace_rig import ROBOT_JOINTS
 from envs.mazes.maze import UNIT
 from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import read_finished
 from qdos_brax.analysis.film import of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun
 from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.device import to_device
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
+from qdos_brax.skills.graph_phase import graph_costs
+from qdos_brax.skills.slow_features import fit_slow_features
 
 WALL = 1.3  # m between the body and the nearest wall's face, at most, of a state at a wall
 AWAY = 1.5  # m
+MOVED = 0.02  # m or rad
+NEAREST = 5  # logged states that tell the cost to go
 
 
 class Skills:
@@ -48,40 +64,125 @@ class Skills:
 
     def __init__(self, trained: TrainedRun, member: int, draws: int) -> None:
         artifacts, hyper = of_member(trained, member)
-        self.env, self._horizon, self._draws = trained.env, trained.config.skills.horizon, draws
+        self.env, self.horizon, self._draws = trained.env, trained.config.skills.horizon, draws
         self._agent: Any = trained.agent(artifacts, hyper)
         self.play = jax.jit(self._play)
+        self.reset_to = jax.jit(jax.vmap(lambda qpos, qvel, extra: self.env.reset_to(qpos, qvel, extra=extra)))
 
-    def _play(self, qpos: jax.Array, qvel: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
-        """Return what each draw leads to from states[S]: [draws, S] of success, qpos, qvel, steps and z."""
-        keys = jax.random.split(key, (self._draws, len(qpos)))
-        return jax.vmap(jax.vmap(self._macro_step), in_axes=(None, None, 0))(qpos, qvel, keys)
+    def _play(self, states: State, key: jax.Array) -> dict[str, Any]:
+        """Return what each draw leads to from states[S]: [draws, S] of the end (a State), success, score, steps, z."""
+        keys = jax.random.split(key, (self._draws, len(states.reward)))
+        return jax.vmap(jax.vmap(self._macro_step), in_axes=(None, 0))(states, keys)
 
-    def _macro_step(self, qpos: jax.Array, qvel: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
+    def _macro_step(self, start: State, key: jax.Array) -> dict[str, Any]:
         agent, env = self._agent, self.env
-        start = env.reset_to(qpos, qvel)
         normal = agent.normaliser(start.obs)
         action = agent.low_level.first(agent.skills, key, normal, agent.box)
         skill = agent.skill(action, normal)
 
-        def step(carry: Any, index: jax.Array) -> tuple[Any, None]:
+        def reached(state: State) -> jax.Array:
+            physics = state.pipeline_state
+            return env.success(physics.qpos, state.info["goal"], physics.extra)
+
+        def step(carry: Any, index: jax.Array) -> tuple[Any, jax.Array]:
             state, success, steps = carry
             new = env.step(state, agent.play(state.obs, skill, index))
             state = jax.tree.map(lambda a, b: jnp.where(success, a, b), state, new)
-            steps = steps + ~success
-            return (state, success | env.success(state.pipeline_state.qpos, state.info["goal"]), steps), None
+            return (state, success | reached(state), steps + ~success), state.metrics.get("score", success)
 
-        first = (start, env.success(qpos, start.info["goal"]), jnp.zeros((), jnp.int32))
-        (state, success, steps), _ = jax.lax.scan(step, first, jnp.arange(self._horizon))
-        physics = state.pipeline_state
+        first = (start, reached(start), jnp.zeros((), jnp.int32))
+        (end, success, steps), scores = jax.lax.scan(step, first, jnp.arange(self.horizon))
         latent = skill[: agent.low_level.width]
-        return {"success": success, "qpos": physics.qpos, "qvel": physics.qvel, "steps": steps, "latent": latent}
+        return {"end": end, "success": success, "score": scores.max(), "steps": steps, "latent": latent}
 
 
-def progress(env: Any, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the decrease of the shortest path from qpos ``before[S, nq]`` to ``after[N, S, nq]``."""
-    left = np.nan_to_num(env.distance_left(after.reshape(-1, after.shape[-1])), posinf=1e3).reshape(after.shape[:2])
-    return np.nan_to_num(env.distance_left(before), posinf=1e3) - left
+class Truth(Protocol):
+    """Define what is measured of a task's macro steps. States are batches on the host."""
+
+    reach_name: str
+
+    def left(self, states: State) -> np.ndarray:
+        """Return float64[...], how far the states are from success."""
+        ...
+
+    def outcome(self, before: State, after: State) -> np.ndarray:
+        """Return float[N, S, k], what happened between states[S] and states[N, S]."""
+        ...
+
+    def reach(self, before: State, after: State) -> np.ndarray:
+        """Return bool[N, S'], whether a macro step gets at what there is to get at, of the states where it counts."""
+        ...
+
+
+class MazeTruth:
+    """Measure ways on the floor.
+
+    Args:
+        env: a maze.
+    """
+
+    reach_name = "freed_from_walls"
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+
+    def left(self, states: State) -> np.ndarray:
+        """Return the shortest path to the goal."""
+        qpos = np.asarray(states.pipeline_state.qpos)
+        left = self._env.distance_left(qpos.reshape(-1, qpos.shape[-1])).reshape(qpos.shape[:-1])
+        return np.nan_to_num(left, posinf=1e3)
+
+    def outcome(self, before: State, after: State) -> np.ndarray:
+        """Return where the body got, as seen from its start."""
+        start, end = (np.asarray(states.pipeline_state.qpos) for states in (before, after))
+        pose = np.asarray(self._env.body_frame.pose(jnp.asarray(start)))  # an ant's observation begins with its qpos
+        turn = pose[:, 2] - 1j * pose[:, 3]
+        moved = ((end[..., 0] - start[:, 0]) + 1j * (end[..., 1] - start[:, 1])) * turn
+        return np.stack([moved.real, moved.imag], axis=-1)
+
+    def reach(self, before: State, after: State) -> np.ndarray:
+        """Return whether the body gets away from the wall at which it stands."""
+        far = np.linalg.norm(self.outcome(before, after), axis=-1) > AWAY
+        return far[:, at_walls(self._env, np.asarray(before.pipeline_state.qpos))]
+
+
+class ArmTruth:
+    """Measure what an arm does to things, and the cost to go on the graph of logged states.
+
+    Args:
+        trained: the run, which says how the graph is made.
+        dataset: its data.
+    """
+
+    reach_name = "moves_things"
+
+    def __init__(self, trained: TrainedRun, dataset: Dataset) -> None:
+        values, horizon = trained.config.values, trained.config.skills.horizon
+        data, self._normalise = to_device(dataset, horizon)
+        seen = np.asarray(data.observations), np.asarray(data.next_observations)
+        self._features = fit_slow_features(*seen, np.asarray(data.starts), horizon, values.slowness)
+        self._tree = KDTree(self._features(seen[0]))
+        self._costs, self._jump = graph_costs(values, horizon, data, dataset.ends), horizon * values.jump_cost
+        self._things = ROBOT_JOINTS if hasattr(trained.env, "rig") else JOINTS
+
+    def left(self, states: State) -> np.ndarray:
+        """Return the cost to go of the nearest logged states, the way to them included."""
+        features = self._of(states)
+        distance, rows = self._tree.query(features.reshape(-1, features.shape[-1]), NEAREST, workers=-1)
+        return (self._costs[rows] + self._jump * distance).min(axis=1).reshape(features.shape[:-1]).astype(np.float64)
+
+    def outcome(self, before: State, after: State) -> np.ndarray:
+        """Return the change of the graph's features."""
+        return self._of(after) - self._of(before)
+
+    def reach(self, before: State, after: State) -> np.ndarray:
+        """Return whether anything but the arm moves."""
+        start, end = (np.asarray(states.pipeline_state.qpos)[..., self._things :] for states in (before, after))
+        return (np.abs(end - start) > MOVED).any(axis=-1)
+
+    def _of(self, states: State) -> np.ndarray:
+        seen = np.asarray(self._normalise(states.obs))
+        return self._features(seen.reshape(-1, seen.shape[-1])).reshape(*seen.shape[:-1], -1)
 
 
 def at_walls(env: Any, qpos: np.ndarray) -> np.ndarray:
@@ -99,53 +200,70 @@ def r2(target: np.ndarray, *given: np.ndarray) -> float:
     return float(1 - (error**2).mean() / target[~half].var(axis=0).mean())
 
 
-def displacement(env: Any, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return float[N, S, 2], where the body got, as seen from the start."""
-    pose = np.asarray(env.body_frame.pose(jnp.asarray(before)))  # an ant's observation begins with its qpos
-    turn = pose[:, 2] - 1j * pose[:, 3]
-    moved = ((after[..., 0] - before[:, 0]) + 1j * (after[..., 1] - before[:, 1])) * turn
-    return np.stack([moved.real, moved.imag], axis=-1)
-
-
-def from_logged_states(skills: Skills, dataset: Dataset, states: int) -> dict[str, float]:
+def from_logged_states(skills: Skills, truth: Truth, dataset: Dataset, states: int) -> dict[str, float]:
     """Return the measures that need no episodes."""
     rows = np.random.default_rng(0).choice(len(dataset.qpos), states, replace=False)
-    qpos, qvel = dataset.qpos[rows], dataset.qvel[rows]
-    found = {name: np.asarray(value) for name, value in skills.play(qpos, qvel, jax.random.key(1)).items()}
-    gain = progress(skills.env, qpos, found["qpos"])
-    moved = displacement(skills.env, qpos, found["qpos"])
-    far = np.linalg.norm(moved, axis=-1).max(axis=0) > AWAY
-    z = found["latent"].reshape(-1, found["latent"].shape[-1])
-    seen = np.tile(dataset.observations[rows], (len(moved), 1))
-    where = moved.reshape(len(z), -1)
-    # What a displacement says of z depends on the state.
-    turned = (where[:, :, None] * seen[:, None, :]).reshape(len(z), -1)
+    extra = np.zeros((states, skills.env.extra_size), np.int32) if dataset.extra is None else dataset.extra[rows]
+    before = skills.reset_to(dataset.qpos[rows], dataset.qvel[rows], extra)
+    found = skills.play(before, jax.random.key(1))
+    gain = truth.left(before) - truth.left(found["end"])
+    outcome = truth.outcome(before, found["end"])
+    z = np.asarray(found["latent"]).reshape(-1, found["latent"].shape[-1])
+    seen = np.tile(dataset.observations[rows], (len(outcome), 1))
+    happened = outcome.reshape(len(z), -1)
+    # What an outcome says of z depends on the state.
+    turned = (happened[:, :, None] * seen[:, None, :]).reshape(len(z), -1)
     return {
         "progress_mean": float(gain.mean()),
         "progress_best": float(gain.max(axis=0).mean()),
-        "spread": float(np.sqrt(moved.var(axis=0).sum(axis=-1)).mean()),
+        "spread": float(np.sqrt(outcome.var(axis=0).sum(axis=-1)).mean()),
         "r2_state": r2(z, seen),
-        "r2_state_and_outcome": r2(z, seen, where, turned),
-        "freed_from_walls": float(far[at_walls(skills.env, qpos)].mean()),
+        "r2_state_and_outcome": r2(z, seen, happened, turned),
+        truth.reach_name: float(truth.reach(before, found["end"]).any(axis=0).mean()),
     }
 
 
-def oracle(skills: Skills, episodes: int) -> dict[str, float]:
-    """Return success and mean steps of episodes by the draw of most true progress."""
+class Episodes(NamedTuple):
+    """Hold how episodes went, [episodes] each."""
+
+    success: np.ndarray
+    score: np.ndarray
+    steps: np.ndarray
+
+
+def play_episodes(skills: Skills, choose: Callable[[State, Any], np.ndarray], episodes: int) -> Episodes:
+    """Play episodes in which ``choose`` picks one of the draws of each macro step: (before, found) -> int[episodes]."""
     env = skills.env
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(7), episodes)).pipeline_state
-    qpos, qvel = np.asarray(states.qpos), np.asarray(states.qvel)
-    steps, done = np.zeros(episodes), np.zeros(episodes, bool)
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(7), episodes))
+    steps, score, done = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes, bool)
     for decision in range(env.episode_length):
-        found = {name: np.asarray(value) for name, value in skills.play(qpos, qvel, jax.random.key(decision)).items()}
-        gain = np.where(found["success"], np.inf, progress(env, qpos, found["qpos"]))
-        best = gain.argmax(axis=0), np.arange(episodes)
-        steps += np.where(done, 0, found["steps"][best])
-        done = done | (found["success"][best] & (steps < env.episode_length))
-        qpos, qvel = found["qpos"][best], found["qvel"][best]
+        found = skills.play(states, jax.random.key(decision))
+        best = np.asarray(choose(states, found)), np.arange(episodes)
+        steps += np.where(done, 0, np.asarray(found["steps"])[best])
+        score = np.where(done, score, np.maximum(score, np.asarray(found["score"])[best]))
+        done = done | (np.asarray(found["success"])[best] & (steps <= env.episode_length))
+        states = jax.tree.map(lambda leaf, best=best: leaf[best], found["end"])
         if done.all() or steps[~done].min() >= env.episode_length:
             break
-    return {"oracle_success": float(done.mean()), "oracle_steps": float(steps[done].mean()) if done.any() else np.nan}
+    return Episodes(done, np.where(done, 1.0, score), steps)
+
+
+def whole_episodes(skills: Skills, truth: Truth, episodes: int) -> dict[str, float]:
+    """Return how random skills and the oracle do."""
+
+    def most_progress(before: State, found: Any) -> np.ndarray:
+        gain = truth.left(before) - truth.left(found["end"])
+        return np.where(np.asarray(found["success"]), np.inf, gain).argmax(axis=0)
+
+    at_random = play_episodes(skills, lambda before, _: np.zeros(len(before.reward), int), episodes)
+    oracle = play_episodes(skills, most_progress, episodes)
+    return {
+        "random_success": float(at_random.success.mean()),
+        "random_score": float(at_random.score.mean()),
+        "oracle_success": float(oracle.success.mean()),
+        "oracle_score": float(oracle.score.mean()),
+        "oracle_steps": float(oracle.steps[oracle.success].mean()) if oracle.success.any() else np.nan,
+    }
 
 
 def measure(run: Path, draws: int, states: int, episodes: int) -> list[dict[str, Any]]:
@@ -156,7 +274,8 @@ def measure(run: Path, draws: int, states: int, episodes: int) -> list[dict[str,
     for member, settings in enumerate(configs.members(trained.config)):
         started = time.perf_counter()
         skills = Skills(trained, member, draws)
-        found = from_logged_states(skills, dataset, states) | oracle(skills, episodes)
+        truth: Truth = MazeTruth(trained.env) if trained.env.floor_map() else ArmTruth(trained, dataset)
+        found = from_logged_states(skills, truth, dataset, states) | whole_episodes(skills, truth, episodes)
         row = {"task": trained.config.env, "method": trained.config.method, "view": trained.config.skills.view}
         rows.append(row | settings | found | {"seconds": time.perf_counter() - started})
         print(
@@ -168,7 +287,7 @@ def measure(run: Path, draws: int, states: int, episodes: int) -> list[dict[str,
 def main() -> None:
     """Measure the runs named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a finished run of a maze, with skills")
+    parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a finished run with skills")
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="the CSV to write")
     parser.add_argument("--draws", type=int, default=16, help="skills drawn in each state (default 16)")
     parser.add_argument("--states", type=int, default=500, help="logged states (default 500)")

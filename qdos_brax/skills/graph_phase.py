@@ -14,7 +14,7 @@ from qdos_brax.config import SkillsConfig, ValuesConfig
 from qdos_brax.data.device import DeviceData
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
-from qdos_brax.skills.slow_features import slow_features
+from qdos_brax.skills.slow_features import fit_slow_features
 from qdos_brax.skills.state_graph import costs_to_go, step_costs
 from qdos_brax.skills.value_phase import segment_advantages
 from qdos_brax.skills.weights import scaled_advantage
@@ -81,7 +81,7 @@ def graph_costs(values: ValuesConfig, horizon: int, data: DeviceData, ends: np.n
         ends: bool[N], the last row of each episode.
     """
     observations, next_observations = np.asarray(data.observations), np.asarray(data.next_observations)
-    features = slow_features(observations, next_observations, np.asarray(data.starts), horizon, values.slowness)
+    features = fit_slow_features(observations, next_observations, np.asarray(data.starts), horizon, values.slowness)
     costs = step_costs(np.asarray(data.rewards))
     if costs.min() > 0:
         what = "no success in the data" if np.all(data.masks) else "rewards do not tell success apart"
@@ -91,7 +91,7 @@ def graph_costs(values: ValuesConfig, horizon: int, data: DeviceData, ends: np.n
             flush=True,
         )
     return costs_to_go(
-        features,
+        features(observations),
         costs,
         ends,
         max_nodes=values.max_nodes,

@@ -9,6 +9,7 @@ map of Noe et al. (2016) up to a factor: distances then count in lags, the time 
 from __future__ import annotations
 
 import sys
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -18,10 +19,29 @@ _SMALLEST_VARIANCE = 1e-6  # of a principal direction, relative to the largest: 
 _SMALLEST_CHANGE = 1e-4  # 1 - autocorrelation: what never changes within an episode must not become infinitely far
 
 
-def slow_features(
+class SlowFeatures(NamedTuple):
+    """Hold a linear map to slow features, each with mean square change 1 over the lag.
+
+    Attributes:
+        mean: float64[obs].
+        directions: float64[obs, F], slowest first.
+    """
+
+    mean: np.ndarray
+    directions: np.ndarray
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Return the features float32[N, F] of observations[N, obs], in blocks."""
+        features = np.empty((len(observations), self.directions.shape[1]), np.float32)
+        for rows in _blocks(len(observations)):
+            features[rows] = (observations[rows] - self.mean) @ self.directions
+        return features
+
+
+def fit_slow_features(
     observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, lag: int, slowness: float
-) -> np.ndarray:
-    """Return the features whose autocorrelation over ``lag`` steps is at least ``slowness``; the slowest one in
+) -> SlowFeatures:
+    """Find the features whose autocorrelation over ``lag`` steps is at least ``slowness``; the slowest one in
     any case, and a line says so if none other is left.
 
     Args:
@@ -30,9 +50,6 @@ def slow_features(
         starts: int[S], S >= 1, first rows of the windows of ``lag`` rows inside one episode.
         lag: steps.
         slowness: 0 to 1.
-
-    Returns:
-        float32[N, F], slowest first, each with mean square change 1 over ``lag`` steps.
     """
     mean, covariance, lagged = _moments(observations, next_observations, starts, lag)
     variance, axes = scipy.linalg.eigh(covariance)
@@ -49,11 +66,7 @@ def slow_features(
         )
     slow = autocorrelation >= min(slowness, largest)
     change = 2 * np.maximum(1 - autocorrelation[slow], _SMALLEST_CHANGE)  # mean square, of a feature of variance 1
-    directions = whiten @ rotation[:, slow] / np.sqrt(change)
-    features = np.empty((len(observations), directions.shape[1]), np.float32)
-    for rows in _blocks(len(observations)):
-        features[rows] = ((observations[rows] - mean) @ directions)[:, ::-1]
-    return features
+    return SlowFeatures(mean, (whiten @ rotation[:, slow] / np.sqrt(change))[:, ::-1])
 
 
 def _moments(

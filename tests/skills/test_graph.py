@@ -14,7 +14,7 @@ from qdos_brax.data.quality import auc
 from qdos_brax.data.segments import segment_starts
 from qdos_brax.errors import UserError
 from qdos_brax.skills.graph_phase import GraphPhase
-from qdos_brax.skills.slow_features import slow_features
+from qdos_brax.skills.slow_features import fit_slow_features
 from qdos_brax.skills.state_graph import costs_to_go, step_costs
 from tests.point import GOAL, TOLERANCE, bound, point_config, point_dataset
 
@@ -106,14 +106,14 @@ def test_slow_features_find_the_slow_direction_and_its_scale():
     mixed = hidden @ np.array([[0.6, 0.8, 1.0], [1.6, -1.2, 3.0]])  # three columns of two sources
     observations, next_observations = (mixed[:, s].reshape(-1, 3) for s in (slice(0, -1), slice(1, None)))
     starts = segment_starts(np.tile(np.arange(length) == length - 1, episodes), lag)
-    features = slow_features(observations, next_observations, starts, lag, slowness=0.9)
+    features = fit_slow_features(observations, next_observations, starts, lag, slowness=0.9)(observations)
     assert features.shape == (episodes * length, 1)
     slow = hidden[:, :-1, 0].reshape(-1)
     assert abs(np.corrcoef(features[:, 0], slow)[0, 1]) > 0.99
     # variance of a feature with mean square change 1: 1 / (2 (1 - a^lag))
     assert features.std() == pytest.approx(np.sqrt(1 / (2 * (1 - 0.995**lag))), rel=0.1)
-    assert slow_features(observations, next_observations, starts, lag, slowness=1.0).shape[1] == 1
-    assert slow_features(observations, next_observations, starts, lag, slowness=0.0).shape[1] == 2
+    assert fit_slow_features(observations, next_observations, starts, lag, slowness=1.0).directions.shape[1] == 1
+    assert fit_slow_features(observations, next_observations, starts, lag, slowness=0.0).directions.shape[1] == 2
 
 
 def run(config: configs.Config, dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
