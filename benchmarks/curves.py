@@ -1,8 +1,9 @@
 """Keep the learning curves of finished runs: ``python benchmarks/curves.py RUN [RUN ..] --out results/curves.csv``.
 
-One row per evaluation of a member: task, method, preset, view, alpha, seed, environment steps, success, steps
-of the first goal, minutes of the whole run, and the command. Rows of other runs that are in the file stay; rows of the
-same command are replaced.
+One row per evaluation of a member: task, method, preset, view, alpha, seed, environment steps, success, score (the
+share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole run, and
+the command, with the name alone of a data file. Rows of other runs that are in the file stay; rows of the same command
+are replaced.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from qdos_brax.report.study import Study, read_study
 
 COLUMNS = (
     *("env", "method", "preset", "view", "alpha", "seed"),
-    *("env_steps", "eval_success", "first_goal_step", "minutes_of_the_run", "command"),
+    *("env_steps", "eval_success", "eval_score", "first_goal_step", "minutes_of_the_run", "command"),
 )
 
 
@@ -28,6 +29,7 @@ def rows_of(study: Study) -> list[dict[str, str]]:
     for run in study.runs:
         origin = json.loads((run.path / "run.json").read_text(encoding="utf-8"))
         words = origin["command"]
+        words = [Path(word).name if words[k - 1] == "--dataset" else word for k, word in enumerate(words)]
         kept = [word for k, word in enumerate(words) if word != "--out" and words[k - 1] != "--out"]
         about = {
             "preset": str(run.summary["preset"]),
@@ -41,8 +43,10 @@ def rows_of(study: Study) -> list[dict[str, str]]:
             own["alpha"] = str(member.values.get("skills.alpha", ""))
             for row in member.rows:
                 if row.get("eval/success"):
-                    success = f"{float(row['eval/success']):.3g}"
-                    found.append(about | own | {"env_steps": row["env_steps"], "eval_success": success})
+                    measured = {"eval_success": f"{float(row['eval/success']):.3g}"}
+                    if row.get("eval/score"):
+                        measured["eval_score"] = f"{float(row['eval/score']):.3g}"
+                    found.append(about | own | measured | {"env_steps": row["env_steps"]})
     return found
 
 
