@@ -54,7 +54,7 @@ class InformationTerm(Protocol):
 
 
 class SegmentTerm:
-    """Tell skills apart by the posterior of the trajectory VAE, from states and actions (paper, eq. 5).
+    """Identify skills by the posterior of the trajectory VAE, from states and actions (paper, eq. 5).
 
     Args:
         model: the skills.

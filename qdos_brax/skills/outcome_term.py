@@ -57,7 +57,7 @@ class OutcomeState(struct.PyTreeNode):
 
 
 class OutcomeTerm:
-    """Tell skills apart by their outcomes alone.
+    """Identify skills by their outcomes alone.
 
     States of the simulator carry no gradient; a forward model, learned beside from the data and from the rollouts, says
     how the outcome of a rollout changes with its actions (``ForwardModel.follow``).
@@ -104,7 +104,7 @@ class OutcomeTerm:
         return OutcomeState(params, ADAM.init(params), memory, jnp.zeros((), jnp.int32))
 
     def receive(self, state: OutcomeState, params: Any, rollout: Rollout) -> tuple[OutcomeState, PlayedSkills]:
-        """Remember the rollouts in place of the oldest ones."""
+        """Keep the rollouts, in place of the oldest ones."""
         seen = self._model.see_along(params, rollout.observations)
         actions = self._act(params, seen[:, :-1], rollout.latent[:, None])
         played = PlayedSkills(seen, actions, rollout.latent, rollout.place, rollout.weight)
