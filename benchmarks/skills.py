@@ -185,6 +185,11 @@ class ArmTruth:
         return self._features(seen.reshape(-1, seen.shape[-1])).reshape(*seen.shape[:-1], -1)
 
 
+def truth_of(trained: TrainedRun, dataset: Dataset) -> Truth:
+    """Return what can be measured of a run's task."""
+    return MazeTruth(trained.env) if trained.env.floor_map() else ArmTruth(trained, dataset)
+
+
 def at_walls(env: Any, qpos: np.ndarray) -> np.ndarray:
     """Return bool[S], whether the body is at most ``WALL`` from a wall's face."""
     gap = np.abs(qpos[:, None, :2] - env.floor_map().walls) - UNIT / 2
@@ -270,11 +275,10 @@ def measure(run: Path, draws: int, states: int, episodes: int) -> list[dict[str,
     """Return one row per member of a finished run."""
     trained, dataset = read_finished(RunFolder.open(run))
     trained = on_mujoco_c(trained)
-    rows = []
+    truth, rows = truth_of(trained, dataset), []
     for member, settings in enumerate(configs.members(trained.config)):
         started = time.perf_counter()
         skills = Skills(trained, member, draws)
-        truth: Truth = MazeTruth(trained.env) if trained.env.floor_map() else ArmTruth(trained, dataset)
         found = from_logged_states(skills, truth, dataset, states) | whole_episodes(skills, truth, episodes)
         row = {"task": trained.config.env, "method": trained.config.method, "view": trained.config.skills.view}
         rows.append(row | settings | found | {"seconds": time.perf_counter() - started})

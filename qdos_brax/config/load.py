@@ -142,6 +142,8 @@ def check_method(config: Config) -> None:
 
 _AS_BEFORE = {
     ("skills", "view"): "world",
+    ("skills", "mi_encoder"): "segment",
+    ("skills", "mi_latent"): "box",
     ("high_level", "actor_updates"): 1,
     ("labels", "latent"): "sample",
     ("labels", "inputs"): "normalised",
@@ -222,3 +224,9 @@ def _check_together(config: Config) -> None:
         )
     if config.skills.advantage == "transition" and config.values.estimator == "graph":
         raise UserError("skills.advantage=transition needs values.estimator=iql; on a graph it is the same as segment")
+    if config.skills.mi_encoder == "outcome" and config.skills.mi_rollout != "physics":
+        raise UserError("skills.mi_encoder=outcome needs skills.mi_rollout=physics: logged states are no outcome of z")
+    if config.skills.mi_encoder == "outcome" and config.skills.view == "body":
+        raise UserError(
+            "skills.mi_encoder=outcome needs skills.view=start or world: the body's present frame hides where it got"
+        )

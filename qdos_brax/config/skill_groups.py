@@ -114,6 +114,20 @@ class SkillsConfig:
         "physics",
         "logged",
     )
+    mi_encoder: str = choice(
+        "segment",
+        "what tells random skills apart: segment (the posterior, by states and actions, as in the paper) or outcome "
+        "(an encoder of its own, by how far slow features of the states got while the skill played)",
+        "segment",
+        "outcome",
+    )
+    mi_latent: str = choice(
+        "box",
+        "where random skills are drawn: box (an absolute box, as in the paper) or played (uniformly over what the high "
+        "level can play in the state, see high_level.latent_map)",
+        "box",
+        "played",
+    )
     mi_every: int = count(20, "gradient steps that use one batch of rollouts")
     mi_batch: int = count(64, "rollouts per batch")
     latent_box: Scannable = number(2.0, "half the side of the box that random skills are drawn from", above=True)

@@ -5,8 +5,8 @@ A new kind is a policy (``qdos_brax.skills.low_level``), its learner, and an ent
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,16 +20,20 @@ from qdos_brax.offline.hilbert import Hilbert
 from qdos_brax.population.phase import MemberPhase
 from qdos_brax.skills.chunks import ActionChunks, NoiseChunks
 from qdos_brax.skills.flow_policy import FlowPolicy
+from qdos_brax.skills.forward_model import ForwardModel, step_scale
 from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
+from qdos_brax.skills.information_terms import InformationTerm, SegmentTerm
 from qdos_brax.skills.low_level import (
     DirectionSkills,
     LowLevelPolicy,
     TrajectorySkills,
     TransitionSkills,
 )
+from qdos_brax.skills.outcome_term import OutcomeTerm
+from qdos_brax.skills.outcomes import fit_outcomes, seen_paths
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, SegmentWeights, UniformWeights
-from qdos_brax.skills.skill_phase import Information, SkillPhase
+from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.vae import SkillModel
 from qdos_brax.skills.value_phase import ValuePhase
 from qdos_brax.skills.values import IQL
@@ -69,7 +73,8 @@ def _trajectory_phases(context: BuildContext) -> list[MemberPhase]:
     config, method = context.config, context.method
     model = make_skill_model(config, context.env)
     view = fit_view(model.view, context.data, context.normaliser, config.skills.horizon)
-    skills = SkillPhase(config, model, _weights(config, method, context.env), _information(context, model), view)
+    information = _information(context, model, view)
+    skills = SkillPhase(config, model, _weights(config, method, context.env), information, view)
     return [value_phase(config, context.env, context.dataset.ends), skills] if method.weighted else [skills]
 
 
@@ -153,10 +158,15 @@ def _weights(config: Config, method: Method, env: SpaceSizes) -> SegmentWeights:
     return LatentWeights(env.observation_size, skills.latent_dim, config.values.hidden, skills.advantage_scale)
 
 
-def _information(context: BuildContext, model: SkillModel) -> Information | None:
+def _information(context: BuildContext, model: SkillModel, view: Mapping[str, Any]) -> InformationTerm | None:
     skills = context.config.skills
     if not context.method.information:
         return None
     if skills.mi_rollout == "logged":
-        return LoggedStates(skills.horizon)
-    return PhysicsRollout(context.env, model, context.normaliser, skills.horizon)
+        return SegmentTerm(model, LoggedStates(skills.horizon))
+    source = PhysicsRollout(context.env, model, context.normaliser, skills.horizon)
+    if skills.mi_encoder == "segment":
+        return SegmentTerm(model, source)
+    seen = seen_paths(model, view, context.data, skills.horizon)
+    forward = ForwardModel(step_scale(seen), model.action_dim, skills.decoder_hidden)
+    return OutcomeTerm(model, source, fit_outcomes(seen), forward, skills.prior_hidden, skills.mi_batch, skills.horizon)

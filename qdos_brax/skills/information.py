@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 from brax.envs.base import State
 
 from envs.task import Task
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.data.segments import window
 from qdos_brax.skills.vae import SkillModel
+
+
+class StateSource(Protocol):
+    """Define where the states along a skill come from."""
+
+    def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
+        """Return normalised observations[B, H + 1, obs], before each action of skill latent[B, z] and after the last,
+        from the segments at starts[B].
+        """
+        ...
 
 
 class PhysicsRollout:
@@ -28,7 +39,7 @@ class PhysicsRollout:
         self._env, self._model, self._normalise, self._horizon = env, model, normaliser, horizon
 
     def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
-        """Return normalised observations[B, H, obs] before each action of the rollouts."""
+        """Return normalised observations[B, H + 1, obs] of the rollouts."""
 
         def one(qpos: jax.Array, qvel: jax.Array, extra: Any, key: jax.Array, latent: jax.Array) -> jax.Array:
             start = self._env.reset_to(qpos, qvel, key=key, extra=extra)
@@ -38,7 +49,8 @@ class PhysicsRollout:
                 observation = self._normalise(state.obs)
                 return self._env.step(state, self._model.act(params, observation, skill)), observation
 
-            return jax.lax.scan(step, start, None, length=self._horizon)[1]
+            end, before = jax.lax.scan(step, start, None, length=self._horizon)
+            return jnp.concatenate([before, self._normalise(end.obs)[None]])
 
         assert data.qpos is not None and data.qvel is not None  # data.requirements saw to it
         # What the physics draws (a teleporter's exit), it draws from the key of the logged state, for all skills.
@@ -58,5 +70,12 @@ class LoggedStates:
         self._horizon = horizon
 
     def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
-        """Return normalised observations[B, H, obs] of the segments."""
-        return window(data.observations, starts, self._horizon)
+        """Return normalised observations[B, H + 1, obs] of the segments."""
+        return logged_path(data, starts, self._horizon)
+
+
+def logged_path(data: DeviceData, starts: jax.Array, horizon: int) -> jax.Array:
+    """Return observations[B, H + 1, obs] of the segments of H rows at starts[B], the one behind the last included."""
+    before = window(data.observations, starts, horizon)
+    after = data.next_observations[starts + horizon - 1]
+    return jnp.concatenate([before, after[:, None]], axis=1)

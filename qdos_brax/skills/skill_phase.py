@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,25 +19,11 @@ from qdos_brax.data.segments import window
 from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.population import health
 from qdos_brax.population.phase import MemberPhase
+from qdos_brax.skills.information_terms import InformationTerm, Rollout
+from qdos_brax.skills.latent_map import Prior, latent_map
 from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
-
-
-class Information(Protocol):
-    """Define where the states of L_info come from."""
-
-    def __call__(self, params: Any, data: DeviceData, starts: jax.Array, latent: jax.Array) -> jax.Array:
-        """Normalised observations[B, H, obs] along which skill z_i is decoded, from the segments at starts[B]."""
-        ...
-
-
-class Rollout(NamedTuple):
-    """Hold random skills and where they led: observations[B, H, obs] (normalised), z[B, latent], segment weights[B]."""
-
-    observations: jax.Array
-    latent: jax.Array
-    weight: jax.Array
 
 
 class SkillPhaseState(struct.PyTreeNode):
@@ -48,6 +34,7 @@ class SkillPhaseState(struct.PyTreeNode):
         params: of the skill model.
         opt_state: Adam's, of ``params``.
         weights: what the segment weights learn.
+        information: what the mutual-information term learns and remembers by itself.
         update: gradient steps so far.
         broken: rollouts whose simulation broke; they are left out.
         healthy: False once a number that is learned stopped being finite; the member is frozen from then on.
@@ -57,6 +44,7 @@ class SkillPhaseState(struct.PyTreeNode):
     params: Any
     opt_state: optax.OptState
     weights: Any
+    information: Any
     update: jax.Array
     broken: jax.Array
     healthy: jax.Array
@@ -72,7 +60,7 @@ class SkillPhase(MemberPhase):
         config: the run's configuration.
         model: posterior, prior and decoder.
         weights: where segment advantages come from.
-        information: where the states of the mutual-information term come from, or None to leave the term out.
+        information: the mutual-information term, or None to leave it out.
         view: what the model's view knows of the data.
         blocks_per_chunk: blocks between two looks of the host.
     """
@@ -82,12 +70,14 @@ class SkillPhase(MemberPhase):
         config: Config,
         model: SkillModel,
         weights: SegmentWeights,
-        information: Information | None,
+        information: InformationTerm | None,
         view: Mapping[str, Any] = MappingProxyType({}),
         blocks_per_chunk: int = 10,
     ) -> None:
         self._skills: SkillsConfig = config.skills
         self._view = view
+        # The map by which random skills are drawn: an absolute box, or where the high level plays.
+        self._drawn = "box" if config.skills.mi_latent == "box" else config.high_level.latent_map
         self._model, self._weights, self._information = model, weights, information
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
         self._blocks = min(blocks_per_chunk, total_blocks)
@@ -116,6 +106,7 @@ class SkillPhase(MemberPhase):
             params=params,
             opt_state=ADAM.init(params),
             weights=self._weights.init(weights_key),
+            information={} if self._information is None else self._information.init(jax.random.fold_in(key, 0)),
             update=jnp.zeros((), jnp.int32),
             broken=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),
@@ -129,8 +120,7 @@ class SkillPhase(MemberPhase):
         block = partial(self._block, data=data, hyper=hyper, artifacts=constants)
         after, info = jax.lax.scan(block, state, keys[1:])
         learned, healthy = health.keep_finite(state.healthy, _learned(after), _learned(state))
-        params, opt_state, weights = learned
-        state = after.replace(key=keys[0], params=params, opt_state=opt_state, weights=weights, healthy=healthy)
+        state = after.replace(key=keys[0], healthy=healthy, **learned)
         return state, jax.tree.map(jnp.mean, info)
 
     def _block(
@@ -138,24 +128,40 @@ class SkillPhase(MemberPhase):
     ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
         """One batch of rollouts, then ``mi_every`` gradient steps on it and on fresh segments."""
         rollout_key, latent_key, update_key = jax.random.split(key, 3)
-        index = jax.random.randint(rollout_key, (self._skills.mi_batch,), 0, data.starts.shape[0])
-        shape = (self._skills.mi_batch, self._skills.latent_dim)
-        latent = hyper["skills.latent_box"] * jax.random.uniform(latent_key, shape, minval=-1.0)
-        rollout = None
+        played = None
         if self._information is not None:
-            starts = data.starts[index]
-            observations = self._information(state.params, data, starts, latent)
-            weight = self._weight(state, self._batch(state, data, index), artifacts, hyper)
-            # One simulation that broke must not cost the member: it is counted, and weighs nothing.
-            finite = jnp.all(jnp.isfinite(observations), axis=(1, 2))
-            observations = jnp.where(finite[:, None, None], observations, 0.0)
-            rollout = Rollout(observations, latent, jnp.where(finite, weight, 0.0))
-            state = state.replace(broken=state.broken + jnp.sum(~finite).astype(jnp.int32))
-        update = partial(self._update, data=data, hyper=hyper, artifacts=artifacts, rollout=rollout)
+            state, rollout = self._roll_out(state, rollout_key, latent_key, data, hyper, artifacts)
+            information, played = self._information.receive(state.information, state.params, rollout)
+            state = state.replace(information=information)
+        update = partial(self._update, data=data, hyper=hyper, artifacts=artifacts, played=played)
         return jax.lax.scan(update, state, jax.random.split(update_key, self._skills.mi_every))
 
+    def _roll_out(
+        self,
+        state: SkillPhaseState,
+        key: jax.Array,
+        latent_key: jax.Array,
+        data: DeviceData,
+        hyper: Any,
+        artifacts: Any,
+    ) -> tuple[SkillPhaseState, Rollout]:
+        """Return ``mi_batch`` random skills and where they led, and the state with those counted that broke."""
+        assert self._information is not None
+        index = jax.random.randint(key, (self._skills.mi_batch,), 0, data.starts.shape[0])
+        starts, half_side = data.starts[index], hyper["skills.latent_box"]
+        action = jax.random.uniform(latent_key, (self._skills.mi_batch, self._skills.latent_dim), minval=-1.0)
+        prior = Prior(*self._model.prior(state.params, data.observations[starts]))
+        latent = latent_map(self._drawn, half_side).to_latent(action, prior)
+        observations = self._information.source(state.params, data, starts, latent)
+        weight = self._weight(state, self._batch(state, data, index), artifacts, hyper)
+        # One simulation that broke must not cost the member: it is counted, and weighs nothing.
+        finite = jnp.all(jnp.isfinite(observations), axis=(1, 2))
+        observations = jnp.where(finite[:, None, None], observations, 0.0)
+        rollout = Rollout(observations, latent, half_side * action, jnp.where(finite, weight, 0.0))
+        return state.replace(broken=state.broken + jnp.sum(~finite).astype(jnp.int32)), rollout
+
     def _update(
-        self, state: SkillPhaseState, key: jax.Array, data: DeviceData, hyper: Any, artifacts: Any, rollout: Any
+        self, state: SkillPhaseState, key: jax.Array, data: DeviceData, hyper: Any, artifacts: Any, played: Any
     ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
         index_key, sample_key = jax.random.split(key)
         index = jax.random.randint(index_key, (self._skills.batch_size,), 0, data.starts.shape[0])
@@ -163,21 +169,31 @@ class SkillPhase(MemberPhase):
         state = state.replace(weights=self._weights.learn(state.weights, batch, artifacts, hyper))
         weight = self._weight(state, batch, artifacts, hyper)
         segments = self._segments(data, index)
+        learn_key, loss_key = jax.random.split(jax.random.fold_in(key, 0))
+        state, found = self._learn_information(state, segments, learn_key)
 
         def loss(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
             total, info = self._model.vae_loss(
                 params, segments, weight, hyper["skills.kl_weight"], sample_key, self._skills.kl_weighted
             )
-            if rollout is None:
+            if self._information is None:
                 return total, info
-            information_loss = self._model.information_loss(params, *rollout)
+            information_loss = self._information.loss(params, state.information, played, loss_key)
             return total + hyper["skills.alpha"] * information_loss, info | {"information_loss": information_loss}
 
         grads, info = jax.grad(loss, has_aux=True)(state.params)
         params, opt_state = adam_step(state.params, state.opt_state, grads, hyper["skills.learning_rate"])
         effective = jnp.sum(weight) ** 2 / jnp.sum(weight**2) / self._skills.batch_size
         state = state.replace(params=params, opt_state=opt_state, update=state.update + 1)
-        return state, info | {"weight_ess": effective}
+        return state, info | found | {"weight_ess": effective}
+
+    def _learn_information(
+        self, state: SkillPhaseState, segments: Segments, key: jax.Array
+    ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
+        if self._information is None:
+            return state, {}
+        information, info = self._information.learn(state.information, state.params, segments, key)
+        return state.replace(information=information), info
 
     def _segments(self, data: DeviceData, index: jax.Array) -> Segments:
         return Segments(*window((data.observations, data.actions), data.starts[index], self._skills.horizon))
@@ -193,5 +209,5 @@ class SkillPhase(MemberPhase):
         return advantage_weights(advantage, hyper["skills.advantage_temperature"], hyper["skills.weight_clip"])
 
 
-def _learned(state: SkillPhaseState) -> tuple[Any, Any, Any]:
-    return state.params, state.opt_state, state.weights
+def _learned(state: SkillPhaseState) -> dict[str, Any]:
+    return {name: getattr(state, name) for name in ("params", "opt_state", "weights", "information")}

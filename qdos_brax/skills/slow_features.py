@@ -52,11 +52,8 @@ def fit_slow_features(
         slowness: 0 to 1.
     """
     mean, covariance, lagged = _moments(observations, next_observations, starts, lag)
-    variance, axes = scipy.linalg.eigh(covariance)
-    kept = variance > _SMALLEST_VARIANCE * variance[-1]
-    whiten = axes[:, kept] / np.sqrt(variance[kept])
-    autocorrelation, rotation = scipy.linalg.eigh(whiten.T @ lagged @ whiten)
-    largest = autocorrelation[-1]
+    autocorrelation, directions = slow_directions(covariance, lagged)
+    largest = autocorrelation[0]
     if largest < slowness:
         print(
             f"values    no feature of the observations has an autocorrelation of values.slowness={slowness:g} over "
@@ -66,7 +63,21 @@ def fit_slow_features(
         )
     slow = autocorrelation >= min(slowness, largest)
     change = 2 * np.maximum(1 - autocorrelation[slow], _SMALLEST_CHANGE)  # mean square, of a feature of variance 1
-    return SlowFeatures(mean, (whiten @ rotation[:, slow] / np.sqrt(change))[:, ::-1])
+    return SlowFeatures(mean, directions[:, slow] / np.sqrt(change))
+
+
+def slow_directions(covariance: np.ndarray, lagged: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (autocorrelation[F], directions[obs, F]) of uncorrelated features of variance 1, slowest first.
+
+    Args:
+        covariance: float64[obs, obs].
+        lagged: float64[obs, obs], symmetric, covariance of each state with the one a lag later.
+    """
+    variance, axes = scipy.linalg.eigh(covariance)
+    kept = variance > _SMALLEST_VARIANCE * variance[-1]
+    whiten = axes[:, kept] / np.sqrt(variance[kept])
+    autocorrelation, rotation = scipy.linalg.eigh(whiten.T @ lagged @ whiten)
+    return autocorrelation[::-1], (whiten @ rotation)[:, ::-1]
 
 
 def _moments(

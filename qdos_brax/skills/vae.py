@@ -41,12 +41,14 @@ class SkillModel:
 
     Attributes:
         latent_dim: width of z.
+        action_dim: width of actions.
+        seen_dim: width of what the view shows of an observation.
         view: as given.
     """
 
     def __init__(self, observation_dim: int, action_dim: int, config: SkillsConfig, view: View | None = None) -> None:
         self.latent_dim, self.view = config.latent_dim, view or WorldView()
-        self._seen_dim, self._action_dim = self.view.size(observation_dim), action_dim
+        self.seen_dim, self.action_dim = self.view.size(observation_dim), action_dim
         self._encoder = SegmentEncoder(config.encoder_hidden, config.encoder_layers, config.latent_dim)
         self._prior = DiagonalGaussian(config.prior_hidden, config.latent_dim)
         self._decoder = DiagonalGaussian(config.decoder_hidden, action_dim)
@@ -54,18 +56,17 @@ class SkillModel:
     def init(self, key: jax.Array, view: Mapping[str, Params] = MappingProxyType({})) -> dict[str, Params]:
         """Return fresh parameters: {"encoder", "prior", "decoder"}, and "view", what the view knows of the data."""
         encoder_key, prior_key, decoder_key = jax.random.split(key, 3)
-        seen, action = jnp.zeros((1, 2, self._seen_dim)), jnp.zeros((1, 2, self._action_dim))
+        seen, action = jnp.zeros((1, 2, self.seen_dim)), jnp.zeros((1, 2, self.action_dim))
         return {
             "encoder": self._encoder.init(encoder_key, seen, action),
             "prior": self._prior.init(prior_key, seen[:, 0]),
-            "decoder": self._decoder.init(decoder_key, jnp.zeros((1, self._seen_dim + self.latent_dim))),
+            "decoder": self._decoder.init(decoder_key, jnp.zeros((1, self.seen_dim + self.latent_dim))),
             "view": dict(view),
         }
 
     def encode(self, params: dict[str, Params], segments: Segments) -> Posterior:
         """Return q(z | tau)."""
-        pose = self._pose(params, segments.observations[:, 0])
-        seen = self._see(params, segments.observations, pose[:, None])
+        seen = self.see_along(params, segments.observations)
         return Posterior(*self._encoder.apply(params["encoder"], seen, segments.actions))
 
     def prior(self, params: dict[str, Params], observation: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -81,8 +82,15 @@ class SkillModel:
     ) -> tuple[jax.Array, jax.Array]:
         """Return pi(a | s, z): (mean[..., act], log standard deviation[..., act]) of a skill that has begun."""
         latent, pose = skill[..., : self.latent_dim], skill[..., self.latent_dim :]
-        seen = self._see(params, observation, pose)
+        return self.decode_seen(params, self._see(params, observation, pose), latent)
+
+    def decode_seen(self, params: dict[str, Params], seen: jax.Array, latent: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return pi(a | s, z) of what the view shows of s, ``seen[..., seen]``, and z[..., latent]."""
         return self._decoder.apply(params["decoder"], jnp.concatenate([seen, latent], axis=-1))
+
+    def see_along(self, params: dict[str, Params], observations: jax.Array) -> jax.Array:
+        """Return what the view shows of observations[B, H, obs] in a skill begun at the first of them, [B, H, seen]."""
+        return self._see(params, observations, self._pose(params, observations[:, 0])[:, None])
 
     def act(self, params: dict[str, Params], observation: jax.Array, skill: jax.Array) -> jax.Array:
         """Return the low-level policy's mean action[..., act], clipped to [-1, 1]."""

@@ -30,6 +30,7 @@ from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
 from qdos_brax.runs.metrics import read_rows
 from qdos_brax.skills.information import PhysicsRollout
+from qdos_brax.skills.information_terms import SegmentTerm
 from qdos_brax.skills.low_level import TrajectorySkills
 from qdos_brax.skills.segment_weights import LoggedWeights
 from qdos_brax.skills.skill_phase import SkillPhase
@@ -51,7 +52,7 @@ def phases() -> dict[str, Any]:
     config = configs.replace(point_config(**SMALL), seed=SEEDS)
     data, normaliser = to_device(point_dataset(episodes=40), config.skills.horizon)
     model = SkillModel(2, 2, SIZES)
-    information = PhysicsRollout(PointEnv(), model, normaliser, config.skills.horizon)
+    information = SegmentTerm(model, PhysicsRollout(PointEnv(), model, normaliser, config.skills.horizon))
     low_level = TrajectorySkills(model, "box")
     policy = BC(2, 2, configs.PolicyConfig(hidden=(16,), batch_size=16))
     sac, warm_up = SAC(2, low_level.width, config.high_level), RandomWarmUp(config.high_level.warmup_env_steps)
@@ -140,7 +141,7 @@ def breaking() -> tuple[SkillPhase, dict[str, jax.Array]]:
     config = configs.replace(point_config(**SMALL, **{"skills.alpha": 1.0}), seed=SEEDS)
     data, normaliser = to_device(point_dataset(episodes=40), config.skills.horizon)
     model = SkillModel(2, 2, SIZES)
-    information = PhysicsRollout(BreakingEnv(), model, normaliser, config.skills.horizon)
+    information = SegmentTerm(model, PhysicsRollout(BreakingEnv(), model, normaliser, config.skills.horizon))
     phase = bound(SkillPhase(config, model, LoggedWeights(), information, blocks_per_chunk=1), config, data)
     return phase, {"advantage": jnp.zeros((3, data.starts.shape[0]))}
 

@@ -27,7 +27,7 @@ def constant_skills(action_size: int) -> Any:
 
 
 def rollouts(env: envs.Task, qpos: np.ndarray, qvel: np.ndarray, latent: np.ndarray) -> np.ndarray:
-    """Observations [N - HORIZON + 1, HORIZON, obs], not normalised, from one logged episode with these states [N]."""
+    """Observations [N - HORIZON + 1, HORIZON + 1, obs], raw, from one logged episode with these states [N]."""
     n = len(qpos)
     rows = {"observations": np.zeros((n, env.observation_size)), "actions": np.zeros((n, env.action_size))}
     ends = np.arange(n) == n - 1
@@ -51,12 +51,12 @@ def test_humanoid_rollouts_see_what_ogbench_sees() -> None:
     qpos, qvel = np.array(start.qpos), np.array(start.qvel)
     latent = np.random.default_rng(0).uniform(-1, 1, (2, 7)).astype(np.float32)
     seen = rollouts(env, qpos, qvel, latent)
-    assert seen.shape == (2, HORIZON, 69)
+    assert seen.shape == (2, HORIZON + 1, 69)
     reference = ogbench_env("humanoidmaze-medium-task1")
     for n in range(2):
         actions = np.tile(latent[n], (HORIZON, 3))
         expected = ogbench_rollout(reference, qpos[n], qvel[n], actions)["obs"]
-        np.testing.assert_allclose(seen[n, 1:], expected[:-1], rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(seen[n, 1:], expected, rtol=1e-6, atol=1e-5)
         np.testing.assert_array_equal(seen[n, 0], env.reset_to(qpos[n], qvel[n]).obs)
 
 

@@ -12,6 +12,7 @@ from qdos_brax import config as configs
 from qdos_brax.data.device import to_device
 from qdos_brax.nn.networks import gaussian_sample
 from qdos_brax.skills.information import LoggedStates, PhysicsRollout
+from qdos_brax.skills.information_terms import SegmentTerm
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
 from qdos_brax.skills.vae import Segments, SkillModel
@@ -66,9 +67,10 @@ def train_skills(config, weights=None, information=True, artifacts=None, chunks=
     model = make_model(config, env)
     source = None
     if information:
-        source = PhysicsRollout(env, model, normaliser, config.skills.horizon)
+        states = PhysicsRollout(env, model, normaliser, config.skills.horizon)
         if config.skills.mi_rollout == "logged":
-            source = LoggedStates(config.skills.horizon)
+            states = LoggedStates(config.skills.horizon)
+        source = SegmentTerm(model, states)
     phase = bound(SkillPhase(config, model, weights or UniformWeights(), source), config, data)
     state, constants = phase.init(jax.random.split(jax.random.key(0), len(configs.members(config))), artifacts or {})
     metrics = {}
@@ -86,7 +88,7 @@ def decodability(env, model, normaliser, params, config):
     keys = jax.random.split(jax.random.key(5), 2)
     starts = data.starts[jax.random.randint(keys[0], (256,), 0, data.starts.shape[0])]
     latent = jax.random.uniform(keys[1], (256, config.skills.latent_dim), minval=-2, maxval=2)
-    observations = rollout(params, data, starts, latent)
+    observations = rollout(params, data, starts, latent)[:, :-1]
     repeated = jnp.broadcast_to(latent[:, None], (256, config.skills.horizon, latent.shape[-1]))
     actions = model.act(params, observations, repeated)
     recovered = model.encode(params, Segments(observations, actions)).mean
@@ -176,7 +178,7 @@ def test_chunks_are_not_traced_again_and_members_differ_by_seed_and_value():
     env = PointEnv()
     data, normaliser = to_device(point_dataset(), config.skills.horizon)
     model = make_model(config, env)
-    source = PhysicsRollout(env, model, normaliser, config.skills.horizon)
+    source = SegmentTerm(model, PhysicsRollout(env, model, normaliser, config.skills.horizon))
     phase = bound(SkillPhase(config, model, UniformWeights(), source, blocks_per_chunk=2), config, data)
     seeds = np.array([member["seed"] for member in configs.members(config)], np.uint32)
     state, constants = phase.init(jax.vmap(jax.random.key)(seeds), {})

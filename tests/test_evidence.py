@@ -1,0 +1,66 @@
+"""The table of evidence without RL: its arms, its arithmetic, and that it is read again instead of measured again."""
+
+from __future__ import annotations
+
+import importlib
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from qdos_brax import config as configs
+
+
+@pytest.fixture(scope="module")
+def evidence() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+        return importlib.import_module("evidence")
+
+
+def test_every_arm_is_there_once_for_every_seed(evidence: Any) -> None:
+    asked = configs.load_config("antmaze-large", "cpu", {"seed": "20,21"})
+    found = [
+        evidence.arm_of(config, member)
+        for program in evidence.programs(["start", "world"], 1.0, 0.3, 3.0)
+        for config in [configs.replace(asked, **program.settings)]
+        for member in configs.members(config)
+    ]
+    expected = {
+        (view, weights, term, seed)
+        for view in ("start", "world")
+        for weights in ("on", "off")
+        for term in ("off", "segment", "outcome")
+        for seed in (20, 21)
+    }
+    assert len(found) == len(expected) and {tuple(arm.values()) for arm in found} == expected
+
+
+def test_an_arms_cell_is_the_mean_over_seeds_with_its_interval(evidence: Any) -> None:
+    """Of two seeds the bootstrap draws (a, a), (a, b), (b, a), (b, b): the interval of 95 % reaches from a to b."""
+    rows = [
+        {"view": "start", "weights": weights, "information": "off", "seed": seed, "spread": value, "seconds": 9.0}
+        for weights, values in (("on", (0.2, 0.6)), ("off", (0.5, 0.5)))
+        for seed, value in enumerate(values)
+    ]
+    head, on, off = evidence.table(rows).splitlines()
+    assert head.split() == ["view", "weights", "information", "seeds", "spread"]
+    assert on.split() == ["start", "on", "off", "2", "0.400", "[0.200,", "0.600]"]
+    assert off.split() == ["start", "off", "off", "2", "0.500", "[0.500,", "0.500]"]
+
+
+def test_a_measured_program_is_read_and_not_trained_again(
+    evidence: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    args = Namespace(out=tmp_path, draws=2, states=3, episodes=0)
+    asked = configs.load_config("antmaze-large", "cpu", {"seed": "20,21"})
+    program = evidence.programs(["start"], 1.0, 0.3, 3.0)[0]
+    calls: list[int] = []
+    monkeypatch.setattr(evidence, "train", lambda *_: calls.append(0))
+    monkeypatch.setattr(evidence, "measure", lambda *_: [{"view": "start", "seed": 20, "spread": 0.25}])
+    first = evidence.run_program(program, asked, None, None, args)
+    again = evidence.run_program(program, asked, None, None, args)
+    assert len(calls) == 1 and float(again[0]["spread"]) == first[0]["spread"] == 0.25
+    evidence.run_program(program, configs.replace(asked, seed=(20,)), None, None, args)
+    assert len(calls) == 2
