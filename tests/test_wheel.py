@@ -4,18 +4,32 @@ from __future__ import annotations
 
 import fnmatch
 import importlib
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 from qdos_brax.commands.main import main
 
 ROOT = Path(__file__).parents[1]
 SETUPTOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
 LEFT_OUT = {".py", ".pyc", ".md"}
+NEWEST_PYTHON = shutil.which("python3.13")
+NEWEST = {
+    "completion",
+    "docs",
+    "minari",
+    "sweeps",
+    "video",
+    "wandb",
+    "warp",
+}  # the extras that constraints-newest.txt pins
 
 
 def data_files() -> list[Path]:
@@ -54,13 +68,42 @@ def test_the_container_copies_what_its_builder_is_given() -> None:
 
 @pytest.mark.quick
 def test_every_dependency_is_pinned_within_its_range() -> None:
-    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
-    pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines if "==" in line)}
-    assert lines[1:] == sorted(lines[1:], key=str.lower) and len(pins) == len(lines) - 1
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    pins, project = read_pins("constraints.txt"), read_project()
     for text in [
         *project["dependencies"],
         *(text for extra in project["optional-dependencies"].values() for text in extra),
     ]:
         wanted = Requirement(text)
         assert wanted.specifier.contains(pins[canonicalize_name(wanted.name)]), text
+
+
+@pytest.mark.quick
+def test_the_newest_versions_are_within_the_ranges() -> None:
+    pins, project = read_pins("constraints-newest.txt"), read_project()
+    extras = [text for name, texts in project["optional-dependencies"].items() if name in NEWEST for text in texts]
+    for text in [*project["dependencies"], *extras]:
+        wanted = Requirement(text)
+        assert wanted.specifier.contains(pins[canonicalize_name(wanted.name)]), text
+    assert Version(pins["jax"]) > Version(read_pins("constraints.txt")["jax"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(NEWEST_PYTHON is None, reason="no python3.13 is on the PATH, for which constraints-newest.txt is")
+def test_the_newest_versions_run_the_smoke_preset() -> None:
+    """In an environment made from nothing; it needs a package index."""
+    subprocess.run([ROOT / ".ci" / "release_check", NEWEST_PYTHON, "constraints-newest.txt"], check=True)
+
+
+def read_pins(name: str) -> dict[str, str]:
+    """Return the versions of a file of constraints, whose names are sorted and different."""
+    lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+    pins = {canonicalize_name(package): version for package, version in (line.split("==") for line in lines[1:])}
+    assert lines[1:] == sorted(lines[1:], key=str.lower) and len(pins) == len(lines) - 1
+    return pins
+
+
+def read_project() -> dict[str, Any]:
+    """Return the table "project" of pyproject.toml."""
+    project: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return project

@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from sklearn.manifold import TSNE  # type: ignore[import-untyped]
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from qdos_brax import config as configs
+from qdos_brax.analysis.embedding import embedded
+from qdos_brax.analysis.episode import measure_episode, place_of_body, play_episode
 from qdos_brax.analysis.film import EpisodeRunner, of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun, evaluation_key
-from qdos_brax.analysis.pictures import draw_episode
 from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, Normaliser, to_device
@@ -31,7 +30,7 @@ _GRID = 5  # skills along each of the two main directions of the latents
 _SPREAD = 2.0  # how far the grid extends along them, in standard deviations
 _BETWEEN = 9  # skills on the line from one to another
 _HELD = 3  # the time that a skill is kept for on the map, in lengths of a segment
-_SEED = 0  # of the sample of segments, and of t-SNE
+_SEED = 0  # of the sample of segments
 
 Arrays = dict[str, np.ndarray]
 
@@ -46,13 +45,15 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
         gain, return, quality: [n], of random segments of the data: the decrease of the shortest path to the goal,
             undiscounted return, index into ``quality_names``.
         quality_names: str[..], the names in ``data.quality.QUALITY`` by their codes.
+        part, part_names: int[n], str[..], which part of the task changed in each segment (``changed_parts``), of tasks
+            that have parts.
         m/weight: float[n], the weight of each segment (methods that weigh them).
-        m/latent, m/tsne: float[n, z], float[n, 2], the posterior's means and their t-SNE embedding (methods that infer
-            skills from segments).
+        m/latent, m/tsne, m/tsne_episode: float[n, z], float[n, 2], float[K, 2], the posterior's means, and where t-SNE
+            lays them and the latents of the episode below (methods that infer skills from segments).
         m/grid, m/between: float[k, T, 2], the positions from the task's start on, under skills along the two
             main directions of the latents, and under skills between the latents of two segments.
-        m/path, m/left, m/latents: float[T, 2], float[T], float[K, z]: an evaluation episode: positions, the
-            distance left to the goal, and the latent of each decision.
+        m/path, m/left, m/parts, m/latents: float[T, 2], float[T], bool[T, P], float[K, z]: an evaluation episode:
+            positions, the distance left to the goal, which parts of the task are done, the latent of each decision.
         m/frames, m/frame_steps: uint8[F, height, width, 3], int[F], pictures of the scene at some of its steps.
         m/film, m/film_speed: uint8[bytes], float[], the episode as a WebP, and how many times as fast it plays.
         goal, walls: float[2], float[W, 2], the goal and the centres of the wall cells.
@@ -70,13 +71,13 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
     members = _first_seeds(trained)
     arrays: Arrays = {"members": np.asarray(members), **_place(trained.env), **_truth(trained, sample)}
     latents, runner = _LatentView(trained, sample), EpisodeRunner(trained)
-    views = {member: latents.of(member) for member in members}
-    with ThreadPoolExecutor(1) as beside:  # t-SNE on one core while the episodes are played on another
-        embeddings = beside.map(embedded, [view.get("latent", np.zeros((0, 0))) for view in views.values()])
-        episodes = [_episode(trained, runner, member) for member in members]
-    for member, embedding, episode in zip(members, embeddings, episodes, strict=True):
-        found = _weights(trained, member, sample) | views[member] | embedding | episode
-        arrays |= {f"{member}/{name}": array for name, array in found.items()}
+    with ThreadPoolExecutor(1) as beside:  # t-SNE on one core while episodes are played and drawn on another
+        for member in members:
+            view, episode = latents.of(member), play_episode(trained, runner, member)
+            places = beside.submit(embedded, view["latent"], episode.latents) if "latent" in view else None
+            measured = measure_episode(trained.env, episode, trained.config.skills.horizon)
+            found = _weights(trained, member, sample) | view | measured | (places.result() if places else {})
+            arrays |= {f"{member}/{name}": array for name, array in found.items()}
     write_arrays(out, arrays)
 
 
@@ -130,6 +131,9 @@ def _truth(trained: TrainedRun, sample: _Sample) -> Arrays:
         gain = quality.progress(trained.env, dataset, starts, horizon)
         if gain is not None:
             found["gain"] = np.where(np.isfinite(gain), gain, np.nan).astype(np.float32)
+    changed = quality.changed_parts(trained.env, dataset, starts, horizon)
+    if changed is not None:
+        found["part"], found["part_names"] = changed
     if dataset.quality is not None:
         found["quality"] = dataset.quality[starts]
         found["quality_names"] = np.asarray(sorted(quality.QUALITY, key=quality.QUALITY.__getitem__))
@@ -187,26 +191,11 @@ class _LatentView:
             state, skill = carry
             skill = jnp.where(t % horizon == 0, agent.begin(state.obs, latent), skill)
             state = env.step(state, agent.play(state.obs, skill, t % horizon))
-            return (state, skill), _place_of_body(env, state.pipeline_state.qpos)
+            return (state, skill), place_of_body(env, state.pipeline_state.qpos)
 
         start = env.reset(evaluation_key())
         _, path = jax.lax.scan(step, (start, agent.begin(start.obs, latent)), jnp.arange(self._steps))
-        return jnp.concatenate([_place_of_body(env, start.pipeline_state.qpos)[None], path])
-
-
-def _place_of_body(env: Any, qpos: Any) -> Any:
-    """Return [..., 2], where what acts is, of a task that has positions."""
-    return next(iter(env.position(qpos).values()))
-
-
-def embedded(latents: np.ndarray) -> Arrays:
-    """Return the t-SNE embedding float32[n, 2] of latents[n, z] as ``tsne``; nothing of few, or if all are the same."""
-    if len(latents) <= _GRID or (latents == latents[0]).all():  # scikit-learn dies of equal ones: no exception
-        return {}
-    latents = np.pad(latents, ((0, 0), (0, max(0, 2 - latents.shape[1]))))  # it starts from two principal components
-    perplexity = min(30.0, (len(latents) - 1) / 3)
-    with threadpool_limits(1):  # on few cores its threads can wait for each other without end
-        return {"tsne": TSNE(perplexity=perplexity, init="pca", random_state=_SEED).fit_transform(latents)}
+        return jnp.concatenate([place_of_body(env, start.pipeline_state.qpos)[None], path])
 
 
 def _main_directions(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -230,25 +219,3 @@ def _between(latents: np.ndarray) -> np.ndarray:
     first, last = latents[order[len(order) // 20]], latents[order[-1 - len(order) // 20]]
     share = np.linspace(0, 1, _BETWEEN)[:, None]
     return np.asarray((1 - share) * first + share * last, np.float32)
-
-
-# --- An episode ------------------------------------------------------------------------------------------------
-
-
-def _episode(trained: TrainedRun, runner: EpisodeRunner, member: int) -> Arrays:
-    states: list[tuple[np.ndarray, ...]] = []
-    latents: list[np.ndarray] = []
-    width = make_low_level(trained.config, trained.env).width  # a skill's first numbers are its latent
-    for state, decision in runner.episode(member):
-        if decision is not None and (len(states) - 1) % trained.config.skills.horizon == 0:
-            latents.append(np.asarray(decision)[:width])
-        physics = state.pipeline_state
-        states.append(tuple(map(np.asarray, (physics.qpos, state.info["goal"], physics.extra))))
-    qpos, goals, extra = map(np.stack, zip(*states, strict=True))
-    found: Arrays = {"latents": np.stack(latents)}
-    left = trained.env.distance_left(qpos, extra)
-    if left is not None:
-        found["left"] = np.asarray(left, np.float32)
-    if trained.env.floor_map() is not None:
-        found["path"] = _place_of_body(trained.env, qpos).astype(np.float32)
-    return found | draw_episode(trained.env, qpos, goals)

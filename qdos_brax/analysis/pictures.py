@@ -9,6 +9,7 @@ from envs.task import Task
 from qdos_brax.report.video import webp
 
 _FRAMES = 6
+_DECISIONS = (0, 7, 14, 22)  # of an episode of a task of parts; those that the paper shows (figure 7)
 _HEIGHT, _WIDTH = 240, 320
 _FILM_FRAMES = 48  # at most: drawing them is a part of every run's end
 _FILM_RATE = 8.0  # frames per second
@@ -20,34 +21,52 @@ def near_camera(env: Task) -> str | None:
     return _NEAR if _NEAR in env.scene().cameras else None
 
 
-def draw_episode(env: Task, qpos: np.ndarray, goals: np.ndarray) -> dict[str, np.ndarray]:
+def picture_steps(states: int, horizon: int | None) -> np.ndarray:
+    """Return int[F], the steps of the states that are shown as pictures, the first and the last one among them.
+
+    Args:
+        states: of the episode, its start included.
+        horizon: control steps between two decisions, to show the states of the paper's decisions and the end, of
+            evenly spread decisions if the episode has fewer; None for states that are evenly spaced.
+    """
+    if horizon is None:
+        return evenly_spaced(_FRAMES, states)
+    decisions = -(-(states - 1) // horizon)
+    chosen = np.asarray(_DECISIONS)
+    if chosen[-1] >= decisions:
+        chosen = evenly_spaced(len(chosen), decisions)
+    return np.append(chosen * horizon, states - 1)
+
+
+def draw_episode(env: Task, qpos: np.ndarray, goals: np.ndarray, shown: np.ndarray) -> dict[str, np.ndarray]:
     """Draw an episode.
 
     Args:
         env: its task.
         qpos: float[T, nq], its states.
         goals: float[T, ..], the goal in each of them.
+        shown: int[F], the steps of its pictures.
 
     Returns:
-        frames: uint8[F, height, width, 3], the first state, the last, and some evenly spaced between them.
+        frames: uint8[F, height, width, 3], its pictures.
         frame_steps: int[F], their steps.
         film: uint8[bytes], a WebP from the first state to the last.
         film_speed: float[], how many times as fast as the simulated time it plays.
         Nothing of these on a machine that cannot draw: a page without pictures is better than none.
     """
-    steps = evenly_spaced(_FILM_FRAMES, len(qpos))
+    filmed = evenly_spaced(_FILM_FRAMES, len(qpos))
     try:
         with Renderer(env, _HEIGHT, _WIDTH, near_camera(env)) as renderer:
-            frames = np.stack([renderer.frame(qpos[step], goals[step]) for step in steps])
+            frames = {step: renderer.frame(qpos[step], goals[step]) for step in np.union1d(filmed, shown).tolist()}
     except NoOpenGL:
         return {}
-    shown = evenly_spaced(_FRAMES, len(steps))
+    film = np.stack([frames[step] for step in filmed.tolist()])
     seconds = (len(qpos) - 1) / steps_per_second(env)
     return {
-        "frames": frames[shown],
-        "frame_steps": steps[shown],
-        "film": np.frombuffer(webp(frames, _FILM_RATE), np.uint8),
-        "film_speed": np.asarray(seconds * _FILM_RATE / len(frames), np.float32),
+        "frames": np.stack([frames[step] for step in shown.tolist()]),
+        "frame_steps": shown,
+        "film": np.frombuffer(webp(film, _FILM_RATE), np.uint8),
+        "film_speed": np.asarray(seconds * _FILM_RATE / len(film), np.float32),
     }
 
 

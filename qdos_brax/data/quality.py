@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from envs.task import Task
@@ -9,6 +11,20 @@ from qdos_brax.data.dataset import Dataset
 
 QUALITY = {"navigate": 0, "noisy": 1, "wander": 2, "fail": 3}
 """What produced a step; every code but 0 is degraded behaviour."""
+
+
+class States(NamedTuple):
+    """Hold simulator states.
+
+    Attributes:
+        qpos: float[N, nq].
+        qvel: float[N, nv].
+        extra: int[N, e], the discrete state; None for a task without.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    extra: np.ndarray | None
 
 
 def progress(env: Task, dataset: Dataset, starts: np.ndarray, horizon: int) -> np.ndarray | None:
@@ -24,13 +40,45 @@ def progress(env: Task, dataset: Dataset, starts: np.ndarray, horizon: int) -> n
     """
     if dataset.qpos is None:
         raise ValueError(f"{dataset.source}: progress needs the simulator's qpos")
-    last = np.asarray(starts) + horizon - 1
-    after = np.where(dataset.ends[last], last, np.minimum(last + 1, dataset.size - 1))
+    after = _rows_after(dataset, starts, horizon)
     before_left, after_left = (_left(env, dataset, rows) for rows in (np.asarray(starts), after))
     if before_left is None or after_left is None:
         return None
     cut_off = np.isinf(before_left) & np.isinf(after_left)  # no way before, no way after: nothing gained or lost
     return np.where(cut_off, 0.0, before_left - np.where(cut_off, 0.0, after_left))
+
+
+def changed_parts(
+    env: Task, dataset: Dataset, starts: np.ndarray, horizon: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return which part of the task was done or undone in the segments that begin at ``starts``.
+
+    As in ``progress``, a segment that ends its episode is judged one step short.
+
+    Returns:
+        int8[S] codes and str[P + 2] names by their codes: "none", the parts in the task's order, "several". None for a
+        task without parts, or data without the states that tell.
+    """
+    if dataset.qpos is None or dataset.qvel is None or (env.extra_size and dataset.extra is None):
+        return None
+    before, after = (
+        env.parts(
+            States(dataset.qpos[rows], dataset.qvel[rows], None if dataset.extra is None else dataset.extra[rows])
+        )
+        for rows in (np.asarray(starts), _rows_after(dataset, starts, horizon))
+    )
+    if before is None or after is None:
+        return None
+    changed = np.stack([np.asarray(before[name]) != np.asarray(after[name]) for name in before], axis=-1)
+    codes = np.where(changed.any(axis=-1), 1 + changed.argmax(axis=-1), 0)
+    codes = np.where(changed.sum(axis=-1) > 1, len(before) + 1, codes)
+    return codes.astype(np.int8), np.asarray(["none", *before, "several"])
+
+
+def _rows_after(dataset: Dataset, starts: np.ndarray, horizon: int) -> np.ndarray:
+    """Return int[S], the rows that hold the states after segments, or their last where their episode ends with them."""
+    last = np.asarray(starts) + horizon - 1
+    return np.where(dataset.ends[last], last, np.minimum(last + 1, dataset.size - 1))
 
 
 def _left(env: Task, dataset: Dataset, rows: np.ndarray) -> np.ndarray | None:

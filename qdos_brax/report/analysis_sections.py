@@ -9,12 +9,19 @@ import numpy as np
 
 from qdos_brax.report.elements import PALETTE, Figure, Section, axis_layout, json_numbers, log_axis
 from qdos_brax.report.episode_section import episode_section
-from qdos_brax.report.maps import MAP_HEIGHT, dots, goal_star, map_layout, path_line
-from qdos_brax.report.member_analysis import MemberAnalysis, quality_colours, quality_groups, quality_names
+from qdos_brax.report.maps import MAP_HEIGHT, dots, embedding_layout, goal_star, map_layout, path_line
+from qdos_brax.report.member_analysis import (
+    MemberAnalysis,
+    part_colours,
+    part_names,
+    quality_colours,
+    quality_groups,
+    quality_names,
+)
 
 PROGRESS = "progress (decrease of the distance to the goal)"
 SKILL_SETS = (("grid", "a grid of skills"), ("between", "from one skill to another"))
-_COLOUR_BY = ("quality", "progress", "return", "weight")
+_COLOUR_BY = ("quality", "subtask", "progress", "return", "weight")
 _PLAIN_MARKER = {"size": 6, "opacity": 0.6, "color": "#9aa1aa", "showscale": False}  # of what is not known
 _COLOUR_BAR = {"thickness": 10, "outlinewidth": 0}
 
@@ -68,8 +75,8 @@ def _latents(analyses: list[MemberAnalysis]) -> Section:
     known = [name for name in _COLOUR_BY if any(name in own for _, own in markers)]
     text = (
         "The same random segments of the data as each method's encoder represents them, laid out by t-SNE. Choose what "
-        "the colour shows: the behaviour that produced a segment, its progress towards the goal, its return or its "
-        "weight. Grey: not known."
+        "the colour shows: the behaviour that produced a segment, which subtask it did or undid, its progress towards "
+        "the goal, its return or its weight. Grey: not known, or no subtask."
     )
     figures = [_latent_chart(analysis, own, known) for analysis, own in markers]
     return Section("Latents of segments (t-SNE)", text, figures=figures, choices=known)
@@ -80,11 +87,8 @@ def _latent_chart(analysis: MemberAnalysis, markers: dict[str, dict[str, Any]], 
     trace = dots(x, y, PALETTE[0], "segment", analysis) | {"marker": next(iter(markers.values()), _PLAIN_MARKER)}
     if facts := _facts(analysis):
         trace |= {"customdata": facts, "hovertemplate": "%{customdata}<extra></extra>"}
-    layout = axis_layout("", "") | {"margin": {"l": 14, "r": 10, "t": 14, "b": 14}}
-    for axis in ("xaxis", "yaxis"):
-        layout[axis] |= {"showticklabels": False, "zeroline": False}
     choices = {name: {"marker": markers.get(name, _PLAIN_MARKER)} for name in known}
-    return Figure(analysis.label, [trace], layout, choices, MAP_HEIGHT)
+    return Figure(analysis.label, [trace], embedding_layout(), choices, MAP_HEIGHT)
 
 
 def _markers(analysis: MemberAnalysis) -> dict[str, dict[str, Any]]:
@@ -92,17 +96,26 @@ def _markers(analysis: MemberAnalysis) -> dict[str, dict[str, Any]]:
     found = {}
     common = {"size": 6, "opacity": 0.8}
     if names := quality_names(analysis):
-        count, colours = len(names), quality_colours(analysis)
-        edges = [[at, colour] for i, colour in enumerate(colours) for at in (i / count, (i + 1) / count)]
-        scale = {"colorscale": edges, "cmin": -0.5, "cmax": count - 0.5}
-        bar = _COLOUR_BAR | {"tickvals": list(range(count)), "ticktext": names}
-        found["quality"] = {**common, **scale, "color": json_numbers(analysis.data["quality"]), "colorbar": bar}
+        found["quality"] = common | _by_code(analysis.data["quality"], names, quality_colours(analysis))
+    if names := part_names(analysis):
+        codes = analysis.data["part"]
+        sizes = {"size": [4 if code == 0 else 8 for code in codes]}  # segments of no subtask are many
+        found["subtask"] = common | sizes | _by_code(codes, names, part_colours(analysis))
     for name, measure in _measures(analysis).items():
         if np.isfinite(measure).any():
             low, high = np.nanquantile(measure, [0.02, 0.98])
             scale = {"colorscale": "Viridis", "cmin": float(low), "cmax": float(high)}
             found[name] = {**common, **scale, "color": json_numbers(measure), "colorbar": _COLOUR_BAR}
     return found
+
+
+def _by_code(codes: np.ndarray, names: list[str], colours: list[str]) -> dict[str, Any]:
+    """Return what colours markers by codes 0, 1, .., and explains the colours."""
+    count = len(names)
+    edges = [[at, colour] for i, colour in enumerate(colours) for at in (i / count, (i + 1) / count)]
+    bar = _COLOUR_BAR | {"tickvals": list(range(count)), "ticktext": names}
+    scale = {"colorscale": edges, "cmin": -0.5, "cmax": count - 0.5}
+    return {**scale, "color": json_numbers(codes), "colorbar": bar}
 
 
 def _measures(analysis: MemberAnalysis) -> dict[str, np.ndarray]:
@@ -115,6 +128,8 @@ def _measures(analysis: MemberAnalysis) -> dict[str, np.ndarray]:
 def _facts(analysis: MemberAnalysis) -> list[str]:
     """Return everything that is known of each segment, in words; [] if nothing is."""
     words = [[f"{name} {value:.3g}" for value in measure] for name, measure in _measures(analysis).items()]
+    if names := part_names(analysis):
+        words.insert(0, [f"subtask: {names[code]}" for code in analysis.data["part"]])
     if names := quality_names(analysis):
         words.insert(0, [names[code] for code in analysis.data["quality"]])
     return ["<br>".join(of_one) for of_one in zip(*words, strict=True)]

@@ -10,6 +10,7 @@ import matplotlib.image
 import numpy as np
 
 from qdos_brax.report.elements import PALETTE, Figure, Film, Image, Section, axis_layout, json_numbers, member_id
+from qdos_brax.report.latent_trajectory import decision_at, latent_trajectory, parts_done
 from qdos_brax.report.maps import MAP_HEIGHT, dots, goal_star, map_layout, path_line
 from qdos_brax.report.member_analysis import MemberAnalysis
 
@@ -26,8 +27,9 @@ def episode_section(analyses: list[MemberAnalysis]) -> Section:
     ]
     shown = [part for part in parts if part.figures or part.films or part.images]
     text = (
-        "The first evaluation episode of each member: the latent of each decision, the distance left to the goal, the "
-        "path, the scene at the marked steps, and a film, as far as the task has them."
+        "The first evaluation episode of each member: the latent of each decision (a skill, played until the next "
+        "one), their path in latent space over segments of the data, the distance left to the goal, the path of what "
+        "acts, the scene at the marked steps, and a film, as far as the task has them."
     )
     shown[:1] = [dataclasses.replace(part, expanded=True) for part in shown[:1]]
     return Section("Skills over an episode", text, subsections=shown)
@@ -37,6 +39,7 @@ def _episode_charts(analysis: MemberAnalysis) -> list[Figure]:
     figures = []
     if "latents" in analysis.own:
         figures.append(_skills_over_time(analysis))
+    figures += latent_trajectory(analysis)
     if "left" in analysis.own:
         figures.append(_distance_over_time(analysis))
     if "path" in analysis.own:
@@ -82,20 +85,29 @@ def _films(analysis: MemberAnalysis) -> list[Film]:
         return []
     source = _data_uri("image/webp", analysis.own["film"].tobytes())
     title = f"the whole episode, {float(analysis.own['film_speed']):.1f} times as fast"
-    steps = f"from step {frames[0][0]}{_left(analysis, 0)} to step {frames[-1][0]}{_left(analysis, -1)}"
+    steps = f"from step {frames[0][0]}{_measured(analysis, 0)} to step {frames[-1][0]}{_measured(analysis, -1)}"
     return [Film(title, source, _jpeg(frames[0][1]), f"Film of the episode of {analysis.label}, {steps}")]
 
 
 def _images(analysis: MemberAnalysis) -> list[Image]:
     return [
-        Image(f"step {step}", _jpeg(frame), f"The scene at step {step}{_left(analysis, step)}")
+        Image(
+            _moment(analysis, step), _jpeg(frame), f"The scene at {_moment(analysis, step)}{_measured(analysis, step)}"
+        )
         for step, frame in _frames(analysis)
     ]
 
 
-def _left(analysis: MemberAnalysis, step: int) -> str:
-    """Return the distance to the goal at a step, in words; nothing for a task that has none."""
-    return f" ({analysis.own['left'][step]:.1f} from the goal)" if "left" in analysis.own else ""
+def _moment(analysis: MemberAnalysis, step: int) -> str:
+    decision = decision_at(analysis, step)
+    return f"step {step}" + ("" if decision is None else f", decision {decision}")
+
+
+def _measured(analysis: MemberAnalysis, step: int) -> str:
+    """Return what a task measures at a step, in words; nothing for a task that measures nothing."""
+    left = f"{analysis.own['left'][step]:.1f} from the goal" if "left" in analysis.own else ""
+    words = "; ".join(filter(None, (left, parts_done(analysis, step))))
+    return f" ({words})" if words else ""
 
 
 def _frames(analysis: MemberAnalysis) -> list[tuple[int, np.ndarray]]:

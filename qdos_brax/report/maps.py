@@ -50,6 +50,14 @@ def map_layout(analysis: MemberAnalysis) -> dict[str, Any]:
     return layout
 
 
+def embedding_layout() -> dict[str, Any]:
+    """Return the layout of a plane whose directions and distances mean nothing, as t-SNE's."""
+    layout = axis_layout("", "") | {"margin": {"l": 14, "r": 10, "t": 14, "b": 14}}
+    for axis in ("xaxis", "yaxis"):
+        layout[axis] |= {"showticklabels": False, "zeroline": False}
+    return layout
+
+
 def _wall(x: float, y: float, half: float) -> dict[str, Any]:
     box = {"x0": float(x) - half, "x1": float(x) + half, "y0": float(y) - half, "y1": float(y) + half}
     return {"type": "rect", **box, "fillcolor": WALL_COLOUR, "line": {"width": 0}, "layer": "below"}

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from qdos_brax.errors import UserError
+from qdos_brax.report.elements import PALETTE
 from qdos_brax.report.study import Member, Run, Study
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import resume_flag
@@ -16,6 +17,7 @@ from qdos_brax.runs.hints import resume_flag
 # By quality code. Collected data have four codes, 0 for good behaviour; other data may have more.
 QUALITY_COLOURS = ("#009E73", "#56B4E9", "#E69F00", "#D55E00", "#CC79A7", "#0072B2")
 WALL_COLOUR = "#b4bac2"
+_NO_PART, _SEVERAL_PARTS = "#9aa1aa", "#5b6470"
 
 
 class MemberAnalysis(NamedTuple):
@@ -62,6 +64,18 @@ def quality_names(analysis: MemberAnalysis) -> list[str]:
 def quality_colours(analysis: MemberAnalysis) -> list[str]:
     """Return one colour for each of ``quality_names``."""
     return [QUALITY_COLOURS[code % len(QUALITY_COLOURS)] for code in range(len(quality_names(analysis)))]
+
+
+def part_names(analysis: MemberAnalysis) -> list[str]:
+    """Return what the codes of ``part`` stand for: "none", the parts of the task, "several"; [] without them."""
+    return [str(name) for name in analysis.data.get("part_names", ())] if "part" in analysis.data else []
+
+
+def part_colours(analysis: MemberAnalysis) -> list[str]:
+    """Return one colour for each of ``part_names``: greys for none and several."""
+    parts = max(0, len(part_names(analysis)) - 2)
+    colours = [PALETTE[i % len(PALETTE)] for i in range(parts)]
+    return [_NO_PART, *colours, _SEVERAL_PARTS] if parts else []
 
 
 def quality_groups(analysis: MemberAnalysis, segments: int) -> Iterator[tuple[np.ndarray, str, str]]:

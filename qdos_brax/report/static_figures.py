@@ -19,10 +19,13 @@ from qdos_brax.report.analysis_sections import PROGRESS, SKILL_SETS, skill_colou
 from qdos_brax.report.curves import save_figure, setting_colours
 from qdos_brax.report.elements import PALETTE
 from qdos_brax.report.episode_section import DISTANCE
+from qdos_brax.report.latent_trajectory import SKILLS_COLOUR, picture_decisions
 from qdos_brax.report.member_analysis import (
     WALL_COLOUR,
     MemberAnalysis,
     maze_extent,
+    part_colours,
+    part_names,
     quality_colours,
     quality_groups,
     quality_names,
@@ -97,15 +100,32 @@ def _weights(axes: Iterable[Axes], analysis: MemberAnalysis) -> None:
 
 def _latents(axes: Iterable[Axes], analysis: MemberAnalysis) -> None:
     by_quality, by_progress, by_return = axes
-    _latents_by_quality(by_quality, analysis)
+    names = quality_names(analysis)
+    colours = ListedColormap(quality_colours(analysis)) if names else None
+    _scatter_latents(by_quality, analysis, "quality", analysis.data.get("quality"), colours, names)
     for axis, name, measure in ((by_progress, "progress", "gain"), (by_return, "return", "return")):
         _scatter_latents(axis, analysis, name, analysis.data.get(measure))
 
 
-def _latents_by_quality(axis: Axes, analysis: MemberAnalysis) -> None:
-    names = quality_names(analysis)
-    colours = ListedColormap(quality_colours(analysis)) if names else None
-    _scatter_latents(axis, analysis, "quality", analysis.data.get("quality"), colours, names)
+def _latents_by_part(axes: Iterable[Axes], analysis: MemberAnalysis) -> None:
+    (axis,) = axes
+    colours = ListedColormap(part_colours(analysis))
+    _scatter_latents(axis, analysis, "subtask", analysis.data["part"], colours, part_names(analysis))
+
+
+def _trajectory(axes: Iterable[Axes], analysis: MemberAnalysis) -> None:
+    """Draw the episode's path in latent space, and its scenes beside it."""
+    plane, *scenes = axes
+    places, decisions = analysis.own["tsne_episode"], picture_decisions(analysis)
+    plane.plot(*analysis.own["tsne"].T, ".", color=SKILLS_COLOUR, alpha=0.4)
+    plane.plot(*places.T, ".-", color=PALETTE[0], linewidth=1)
+    plane.plot(*places[decisions].T, "o", color=PALETTE[1])
+    for decision in set(decisions):
+        plane.annotate(str(decision), places[decision], (0, 5), textcoords="offset points", ha="center")
+    plane.set(xticks=[], yticks=[], xlabel="t-SNE of latents; grey: segments of the data")
+    for scene, frame, decision in zip(scenes, analysis.own.get("frames", ()), decisions, strict=False):
+        scene.imshow(frame)
+        scene.set(xticks=[], yticks=[], xlabel=f"decision {decision}")
 
 
 def _scatter_latents(
@@ -182,6 +202,8 @@ def _draw_map(axis: Axes, analysis: MemberAnalysis) -> None:
 _KINDS = (
     _Kind("weights.png", lambda a: "weight" in a.own and "gain" in a.data, _weights, 1),
     _Kind("latents.png", lambda a: "tsne" in a.own, _latents, 3),
+    _Kind("subtasks.png", lambda a: "tsne" in a.own and "part" in a.data and bool(part_names(a)), _latents_by_part, 1),
+    _Kind("trajectory.png", lambda a: {"tsne", "tsne_episode"} <= set(a.own), _trajectory, 7),
     _Kind("skills.png", lambda a: not a.own.keys().isdisjoint(("grid", "between")), _skills, 2),
     _Kind("episodes.png", lambda a: not a.own.keys().isdisjoint(("latents", "left", "path")), _episode, 3),
 )

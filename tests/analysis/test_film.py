@@ -113,15 +113,26 @@ def test_an_episode_in_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     env = envs.make("antmaze-medium", physics="mujoco")
     qpos = np.tile(np.asarray(env.engine.model.qpos0), (201, 1))
     qpos[:, 0] = np.linspace(0, 4, 201)  # along the first corridor
-    found = pictures.draw_episode(env, qpos, np.tile(np.asarray(env.goal_xy), (201, 1)))
+    goals, shown = np.tile(np.asarray(env.goal_xy), (201, 1)), pictures.picture_steps(201, None)
+    found = pictures.draw_episode(env, qpos, goals, shown)
     assert found["film_speed"] == pytest.approx(20 / 6)
-    assert found["frame_steps"][0] == 0 and found["frame_steps"][-1] == 200 and len(found["frame_steps"]) == 6
+    assert found["frame_steps"].tolist() == [0, 40, 80, 120, 160, 200]
     with PIL.Image.open(io.BytesIO(found["film"].tobytes())) as film:
         assert film.n_frames == 48 and film.size == (64, 48)
     for frame in found["frames"].astype(int):  # the ant's brown in the middle
         assert frame[24, 32, 0] > 130 and frame[24, 32, 0] > frame[24, 32, 2] + 50
     monkeypatch.setenv("MUJOCO_GL", "off")
-    assert pictures.draw_episode(env, qpos, qpos) == {}
+    assert pictures.draw_episode(env, qpos, qpos, shown) == {}
+
+
+def test_which_states_become_pictures() -> None:
+    """Those of the decisions 0, 7, 14 and 22, or of evenly spread ones if there are fewer, and the end."""
+    assert pictures.picture_steps(281, 10).tolist() == [0, 70, 140, 220, 280]
+    assert pictures.picture_steps(222, 10).tolist() == [0, 70, 140, 220, 221]
+    assert pictures.picture_steps(221, 10).tolist() == [0, 70, 140, 210, 220]  # decisions 0 to 21
+    assert pictures.picture_steps(281, 20).tolist() == [0, 80, 180, 260, 280]  # of 14: 0, 4, 9, 13
+    assert pictures.picture_steps(281, None).tolist() == [0, 56, 112, 168, 224, 280]
+    assert pictures.picture_steps(3, 10).tolist() == [0, 2] and pictures.picture_steps(3, None).tolist() == [0, 1, 2]
 
 
 def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:

@@ -78,6 +78,7 @@ def test_inside_and_its_page(analysed: Path, opengl_or_not: bool) -> None:
     mean = (segments - 1 + 10) / segments
     np.testing.assert_allclose(found["0/weight"], [(10 if i == 1 else 1) / mean for i in range(segments)], rtol=1e-5)
     assert found["0/latent"].shape == (segments, 8) and found["0/tsne"].shape == (segments, 2)
+    assert found["0/tsne_episode"].shape == (3, 2) and "part" not in found and "0/parts" not in found
     for name, count in (("grid", 25), ("between", 9)):
         paths = found[f"0/{name}"]
         assert paths.shape == (count, CAP + 1, 2) and np.ptp(paths[:, 0], axis=0).max() == 0
@@ -89,7 +90,7 @@ def test_inside_and_its_page(analysed: Path, opengl_or_not: bool) -> None:
     assert found["0/left"][0] == pytest.approx(float(env.distance_left(start)), rel=1e-5)
     if opengl_or_not:
         assert found["0/frames"].shape == (6, 48, 64, 3) and found["0/frame_steps"].tolist() == [0, 5, 10, 15, 20, 25]
-        assert found["0/film_speed"] == pytest.approx(2.5 / (26 / 10))  # 2.5 s of the simulation in 26 frames
+        assert found["0/film_speed"] == pytest.approx(2.5 / (26 / 8))  # 2.5 s of the simulation in 26 frames
         assert found["0/film"].tobytes()[8:12] == b"WEBP"
 
     written_as_finished(analysed)

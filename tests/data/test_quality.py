@@ -1,5 +1,6 @@
 """AUC against a brute-force count; progress and the report by hand."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -44,6 +45,25 @@ def test_progress_where_there_is_no_way() -> None:
     np.testing.assert_array_equal(gains, [-np.inf, 0.0])
     numbers = quality.report(np.array([0.0, 1.0]), np.ones(2), gains, 1.5)
     assert numbers["losing_share"] == 0.5 and numbers["gaining_share"] == 0.0
+
+
+def test_parts_that_changed_by_hand() -> None:
+    """Two parts, read off the discrete state; a segment that ends its episode is judged by its last state."""
+    extra = np.array([[0, 0], [1, 0], [1, 1], [0, 0], [0, 1], [0, 1]], np.int32)
+    blank = np.zeros((6, 1), np.float32)
+    dataset = Dataset(
+        blank, blank, blank[:, 0], blank[:, 0], np.array([0, 0, 1, 0, 0, 1], bool), blank, blank, blank, extra
+    )
+    env = SimpleNamespace(
+        extra_size=2, parts=lambda rows: {"left": rows.extra[:, 0] == 1, "right": rows.extra[:, 1] == 1}
+    )
+    codes, names = quality.changed_parts(env, dataset, np.array([0, 1, 3, 4]), 2)
+    assert [str(names[code]) for code in codes] == ["several", "right", "right", "none"]
+    codes, _ = quality.changed_parts(env, dataset, np.array([0, 3]), 1)
+    assert [str(names[code]) for code in codes] == ["left", "right"]
+    assert quality.changed_parts(env, replace(dataset, extra=None), np.array([0]), 2) is None
+    env.parts = lambda rows: None
+    assert quality.changed_parts(env, dataset, np.array([0]), 2) is None
 
 
 def test_report_by_hand() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from qdos_brax.analysis import inside
+from qdos_brax.analysis.embedding import embedded
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.methods import settings as method_settings
 from qdos_brax.data.dataset import Dataset
@@ -147,7 +148,8 @@ def test_latents_that_hardly_differ_are_shown_as_far_as_they_can_be(size: int, c
     latents = np.random.default_rng(0).normal(size=(count, size)).astype(np.float32)
     if constant:
         latents[:] = latents[0]
-    found = inside.embedded(latents)
-    assert found.keys() == ({"tsne"} if count == 6 or count == 40 else set()) - ({"tsne"} if constant else set())
+    found = embedded(latents, latents[:0])
+    shown = count >= 6 and not constant
+    assert found.keys() == ({"tsne", "tsne_episode"} if shown else set())
     for array in (*found.values(), inside._grid(latents), inside._between(latents)):
         assert np.isfinite(array).all()

@@ -12,6 +12,7 @@ import pytest
 
 from qdos_brax.report import static_figures
 from qdos_brax.report.analysis_sections import analysis_sections
+from qdos_brax.report.elements import describe
 from qdos_brax.report.member_analysis import quality_colours, quality_groups, quality_names, read_analyses
 from qdos_brax.report.page import write_page
 from qdos_brax.report.study import read_study
@@ -34,9 +35,13 @@ def arrays_of_member_1() -> dict[str, np.ndarray]:
         "gain": gain,
         "quality": np.asarray([0, 0, 0, 0, 0, 3, 3, 2]),
         "quality_names": np.asarray(["good", "noisy", "wandering", "failing"]),
+        "part": np.asarray([0, 1, 0, 2, 0, 3, 0, 0]),
+        "part_names": np.asarray(["none", "kettle", "light", "several"]),
         "1/weight": np.exp(gain),
         "1/latent": rng.normal(size=(8, 3)),
         "1/tsne": rng.normal(size=(8, 2)),
+        "1/tsne_episode": np.asarray([[1.0, 2.0], [3.0, -4.0]]),
+        "1/parts": np.arange(41)[:, None] >= [20, 99],
         "1/grid": rng.normal(size=(4, 6, 2)),
         "1/between": rng.normal(size=(3, 6, 2)),
         "1/path": rng.normal(size=(41, 2)),
@@ -80,21 +85,36 @@ def test_everything_found_is_shown(tmp_path: Path) -> None:
     assert wandering["x"] == [2.0] and wandering["y"] == [pytest.approx(np.exp(2), rel=1e-4)]
     (latents,) = sections[TITLES[1]].figures
     buttons = {name: choice["marker"] for name, choice in latents.choices.items()}
-    assert list(buttons) == list(sections[TITLES[1]].choices) == ["quality", "progress", "return", "weight"]
+    assert list(buttons) == list(sections[TITLES[1]].choices) == [
+        "quality", "subtask", "progress", "return", "weight"
+    ]  # fmt: skip
     assert buttons["return"]["color"] == [-float(i) for i in range(8)] and buttons["quality"]["color"][5] == 3
+    assert buttons["subtask"]["colorbar"]["ticktext"] == ["none", "kettle", "light", "several"]
+    assert buttons["subtask"]["color"] == [0, 1, 0, 2, 0, 3, 0, 0] and buttons["subtask"]["size"][:2] == [4, 8]
+    assert latents.data[0]["customdata"][1].startswith("good<br>subtask: kettle<br>progress")
     for marker in buttons.values():
         go.Scatter(marker=marker)
     grid, between = sections[TITLES[2]].figures
     assert (len(grid.data), len(between.data)) == (4 + 1, 3 + 1)  # and the goal
     assert len(grid.layout["shapes"]) == 8 and grid.layout["xaxis"]["range"] == [-2, 10]
-    skills, way, path = episode.figures
+    skills, trajectory, way, path = episode.figures
+    cloud, decisions, marks = trajectory.data
+    assert len(cloud["x"]) == 8 and decisions["x"] == [1, 3] and decisions["y"] == [2, -4]
+    assert decisions["customdata"] == ["decision 0<br>step 0<br>done: nothing", "decision 1<br>step 20<br>done: kettle"]
+    assert marks["text"] == ["0", "1"] and (marks["x"], marks["y"]) == ([1, 3], [2, -4])
+    assert describe(trajectory) == (
+        "Chart: the episode in latent space (t-SNE); segments of the data, decisions, pictures, by decision"
+    )
     assert skills.data[0]["x"] == [0, 20] and skills.data[0]["z"] == [[1, 0], [0, -4], [0, 2]]
     assert way.data[1]["x"] == [0, 40] and way.data[1]["y"] == [9, 1] and len(path.data[0]["x"]) == 41
-    assert [image.title for image in episode.images] == ["step 0", "step 40"]
-    assert episode.images[1].description == "The scene at step 40 (1.0 from the goal)"
+    assert [image.title for image in episode.images] == ["step 0, decision 0", "step 40, decision 1"]
+    assert episode.images[1].description == "The scene at step 40, decision 1 (1.0 from the goal; done: kettle)"
     (film,) = episode.films
     assert film.title == "the whole episode, 3.2 times as fast" and film.source == "data:image/webp;base64,UklGRg=="
-    assert film.description.endswith("qdos, seed 1, from step 0 (9.0 from the goal) to step 40 (1.0 from the goal)")
+    assert film.description == (
+        "Film of the episode of qdos, seed 1, from step 0 (9.0 from the goal; done: nothing) to step 40 (1.0 from the "
+        "goal; done: kettle)"
+    )
     write_page(study, analyses, tmp_path / "report.html")
     assert (tmp_path / "report.html").read_text().count('<img src="data:image/jpeg;base64,') == 2 + 1
 
@@ -117,7 +137,9 @@ MISSING = [
     ["quality_names", "1/between", "1/left", "1/film"],
     ["1/weight", "1/path", "1/film_speed"],
     ["1/tsne", "1/frames"],
-    ["1/latent", "1/frame_steps"],
+    ["1/latent", "1/frame_steps", "part"],
+    ["1/tsne_episode", "part_names"],
+    ["1/parts"],
     OF_MAZES,
     ["return", *OF_MAZES],
     NAMES,
@@ -125,7 +147,7 @@ MISSING = [
 
 
 def test_every_array_is_missing_once() -> None:
-    assert sorted(itertools.chain(*MISSING[:7])) == sorted(NAMES)
+    assert sorted(itertools.chain(*MISSING[:9])) == sorted(NAMES)
 
 
 @pytest.mark.parametrize("missing", MISSING, ids=" ".join)
@@ -151,11 +173,14 @@ def test_a_task_without_places_has_a_page_of_the_rest(tmp_path: Path) -> None:
     write_inside(run, *OF_MAZES)
     (latents, episodes) = analysis_sections(read_analyses(read_study([run]))[0])
     assert (latents.title, episodes.title) == (TITLES[1], TITLES[3])
-    assert list(latents.choices) == ["quality", "return", "weight"]
-    assert [figure.title for figure in episodes.subsections[0].figures] == ["skills over time"]
-    assert [image.title for image in episodes.subsections[0].images] == ["step 0", "step 40"]
+    assert list(latents.choices) == ["quality", "subtask", "return", "weight"]
+    titles = [figure.title for figure in episodes.subsections[0].figures]
+    assert titles == ["skills over time", "the episode in latent space (t-SNE)"]
+    assert episodes.subsections[0].images[1].description == "The scene at step 40, decision 1 (done: kettle)"
     written = {file.name for file in write_report([run], tmp_path / "out").files}
-    assert {"latents.png", "episodes.png"} <= written and written.isdisjoint(("weights.png", "skills.png"))
+    assert {"latents.png", "subtasks.png", "trajectory.png", "episodes.png"} <= written and written.isdisjoint(
+        ("weights.png", "skills.png")
+    )
     page = (tmp_path / "out" / "report.html").read_text()
     assert TITLES[1] in page and TITLES[0] not in page and TITLES[2] not in page
 

@@ -39,7 +39,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arrays: dict[str, Any] = {
         "members": np.arange(9), "goal": np.array([20.0, 20.0]), "walls": np.asarray(grid),
         "return": rng.normal(size=segments), "gain": rng.normal(size=segments),
-        "quality": rng.integers(0, 4, segments),
+        "quality": rng.integers(0, 4, segments), "part": rng.integers(0, 6, segments),
+        "part_names": np.asarray(["none", "microwave", "kettle", "bottom burner", "light switch", "several"]),
         "quality_names": np.asarray(["navigate", "noisy", "wander", "fail"]),
     }  # fmt: skip
     # Scenes that drift, and films of them as large as those of episodes (150 kB).
@@ -53,8 +54,10 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "grid": 4 + rng.normal(size=(25, 61, 2)).cumsum(axis=1) / 4,
             "between": 4 + rng.normal(size=(9, 61, 2)).cumsum(axis=1) / 4,
             "path": 4 + rng.normal(size=(1001, 2)).cumsum(axis=0) / 9, "left": np.linspace(30, 0, 1001),
-            "latents": rng.normal(size=(50, 8)), "frame_steps": np.linspace(0, 1000, 6).astype(int),
-            "frames": scenes[:6], "film": film, "film_speed": np.float32(8),
+            "latents": rng.normal(size=(50, 8)), "tsne_episode": rng.normal(size=(50, 2)),
+            "parts": np.arange(1001)[:, None] > [100, 400, 600, 900],
+            "frame_steps": np.linspace(0, 1000, 6).astype(int), "frames": scenes[:6],
+            "film": film, "film_speed": np.float32(8),
         }  # fmt: skip
         arrays |= {f"{i}/{name}": array for name, array in own.items()}
     np.savez_compressed(run / "inside.npz", **arrays)
