@@ -131,6 +131,13 @@ def check_method(config: Config) -> None:
         raise UserError(
             f"{config.method} holds its actor near the data by itself: high_level.regulariser must stay entropy"
         )
+    if high.initial != "random" and method.actor_critic != "sac":
+        raise UserError(f"{config.method} is learned offline by its own losses: high_level.initial must stay random")
+    if high.initial != "random" and config.labels.offline_reward != "data":
+        raise UserError(
+            f"high_level.initial={high.initial} learns from the data's rewards: labels.offline_reward must be data, "
+            f"not {config.labels.offline_reward}"
+        )
     if high.utd % high.actor_updates:
         raise UserError(
             f"high_level.utd ({high.utd}) must be a multiple of high_level.actor_updates ({high.actor_updates}): the "
@@ -145,6 +152,7 @@ _AS_BEFORE = {
     ("skills", "mi_encoder"): "segment",
     ("skills", "mi_latent"): "box",
     ("high_level", "actor_updates"): 1,
+    ("high_level", "initial"): "random",
     ("labels", "latent"): "sample",
     ("labels", "inputs"): "normalised",
 }

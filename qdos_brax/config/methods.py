@@ -185,6 +185,35 @@ METHODS = {
         settings=_FLAT | _CONTINUED | {"high_level.utd": 1},
         by_family=_FQL,
     ),
+    # Zhou, Peng, Li, Levine, Kumar 2025, "Efficient online reinforcement learning fine-tuning need not retain offline
+    # data" (arXiv 2412.07762; code zhouzypaul/wsrl, its configurations and launch scripts): warm-up of 5,000 steps, 10
+    # critics, 2 drawn, 4 critic steps of 256 rows per step, no entropy in the backup. The first temperature is 1 there
+    # for rewards of -5 and 5 on ant mazes, 0.1 of ours. Their actor is half as deep on ant mazes, and learns at 1e-4.
+    # IQL in place of their Cal-QL, with the values of their IQL.
+    "wsrl": Method(
+        "no skills; actor and critics of an offline phase go on online without the data (WSRL, Zhou et al. 2025)",
+        low_level="action",
+        settings=_FLAT
+        | _ONLINE_ONLY
+        | {
+            "high_level.initial": "iql",
+            "high_level.target_subset": 2,
+            "high_level.utd": 4,
+            "high_level.init_temperature": 0.1,
+            "high_level.target_entropy_scale": 1.0,
+            "labels.rnd_coefficient": 0.0,
+        },
+        by_family={
+            "antmaze": {"high_level.hidden": [256, 256, 256, 256]},
+            "kitchen": {
+                "high_level.hidden": [512, 512, 512],
+                "high_level.init_temperature": 1.0,
+                "values.expectile": 0.7,
+                "policy.inverse_temperature": 0.5,
+                "flow.updates": 250_000,
+            },
+        },
+    ),
     # Wagenmaker et al. 2025, "Steering your diffusion policy with latent space reinforcement learning" (arXiv
     # 2506.15799; code ajwagen/dsrl): SAC on noise that a box bounds, without the data (their DSRL-SAC; DSRL-NA has a
     # second critic, on actions). Chunks of 4 actions, as their policies for robomimic and gym have.

@@ -48,6 +48,13 @@ class HighLevelConfig:
     """Configure the high-level policy: SAC over skills, learned online."""
 
     hidden: tuple[int, ...] = widths((256, 256, 256), "hidden layers of actor and critics")
+    initial: str = choice(
+        "random",
+        "what actor and critics begin as: random networks, or iql (learned from the labelled data by implicit "
+        "Q-learning in flow.updates steps; they play first and learn after high_level.warmup_env_steps, as in WSRL)",
+        "random",
+        "iql",
+    )
     ensemble: int = count(10, "number of critics")
     target_subset: int = count(1, "critics drawn for the minimum in the target")
     batch_size: int = count(256, "macro transitions per gradient step", low=2)

@@ -50,6 +50,8 @@ class DeviceData(struct.PyTreeNode):
         qpos: float32[N, nq], or None when the file holds no simulator states.
         qvel: float32[N, nv], or None.
         extra: int32[N, e], the discrete state, or None.
+        labels: float32[S, width], one member's decisions u that the windows are labelled with, where a phase asks for
+            them; else None.
     """
 
     observations: jax.Array
@@ -62,6 +64,7 @@ class DeviceData(struct.PyTreeNode):
     qpos: jax.Array | None
     qvel: jax.Array | None
     extra: jax.Array | None = None
+    labels: jax.Array | None = None
 
 
 def fit_normaliser(dataset: Dataset) -> Normaliser:

@@ -125,19 +125,22 @@ class SAC:
     def target_value(
         self, state: SACState, key: jax.Array, next_observation: jax.Array, reference: Reference | None = None
     ) -> jax.Array:
-        """Return the bootstrap value[B]: min over a random subset of target critics at the actor's action.
-
-        Only the chosen heads are evaluated.
-        """
+        """Return the bootstrap value[B]: min over a random subset of target critics at the actor's action."""
         action_key, subset_key = jax.random.split(key)
         action, log_prob = self._sample(state.actor, action_key, next_observation, reference)
-        heads = jax.random.choice(subset_key, self.ensemble, (self.target_subset,), replace=False)
-        chosen = jax.tree.map(lambda p: p[heads], state.target_critic)
-        values = self._target_heads.apply(chosen, jnp.concatenate([next_observation, action], axis=-1))
-        value = self.value_scale * values.min(axis=0)
+        value = self.smallest_of_subset(state.target_critic, subset_key, next_observation, action)
         if self.entropy_backup:
             value = value - jnp.exp(state.log_temperature) * log_prob
         return value
+
+    def smallest_of_subset(
+        self, critic: Params, key: jax.Array, observation: jax.Array, action: jax.Array
+    ) -> jax.Array:
+        """Return the minimum[B] of Q(s, u) over a random subset of critics; only the chosen heads are evaluated."""
+        heads = jax.random.choice(key, self.ensemble, (self.target_subset,), replace=False)
+        chosen = jax.tree.map(lambda p: p[heads], critic)
+        values = self._target_heads.apply(chosen, jnp.concatenate([observation, action], axis=-1))
+        return self.value_scale * values.min(axis=0)
 
     def critic_loss(self, critic: Params, batch: Transition, target: jax.Array) -> jax.Array:
         """Return the mean over batch and sum over critics of the squared error to target[B]."""

@@ -20,6 +20,7 @@ from qdos_brax.data.requirements import refuse, unmet
 from qdos_brax.high_level.actor_critic import AGENT
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.online_phase import OnlinePhase
+from qdos_brax.high_level.sac import SAC
 from qdos_brax.high_level.warm_up import OfflineWarmUp, RandomWarmUp, WarmUp
 from qdos_brax.labels.bonus import Bonus, NoBonus, RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
@@ -37,6 +38,7 @@ from qdos_brax.offline.flat_policy import FlatPolicy
 from qdos_brax.offline.iql_policy import IQLPolicy
 from qdos_brax.offline.learner import Learner, PolicyLearner
 from qdos_brax.offline.offline_phase import Evaluation, OfflinePhase
+from qdos_brax.offline.warm_start import WarmStart
 from qdos_brax.population import memory
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
@@ -77,13 +79,15 @@ def build_phases(context: BuildContext) -> list[MemberPhase]:
     low_level = make_low_level(config, env)
     if method.policy is not None:
         return [_policy_phase(context, method.policy)]
-    labelled = round(config.high_level.batch_size * config.high_level.offline_fraction) > 0
+    high = config.high_level
+    labelled = round(high.batch_size * high.offline_fraction) > 0 or high.initial != "random"
     guide = None if method.guide is None else _GUIDES[method.guide](config, env)
     return [
         *skill_phases(context),
         *([] if guide is None else [offline_phase(context, "guide", guide.learner, config.guide.updates)]),
         *_continued_phases(context),
         *([_label_phase(context, low_level)] if labelled else []),
+        *_warm_start_phases(context, low_level),
         OnlinePhase(
             config,
             env,
@@ -133,9 +137,20 @@ def _continued_phases(context: BuildContext) -> list[MemberPhase]:
     return [offline_phase(context, AGENT, learner, config.flow.updates)]
 
 
+def _warm_start_phases(context: BuildContext, low_level: LowLevelPolicy) -> list[MemberPhase]:
+    """Return the phase that learns SAC's first networks from the labelled data, if they are not random."""
+    config = context.config
+    if config.high_level.initial == "random":
+        return []
+    sac = SAC(context.env.observation_size, low_level.width, config.high_level)
+    learner = WarmStart(sac, config.high_level.hidden, config.skills.horizon, config.flow)
+    return [offline_phase(context, AGENT, learner, config.flow.updates, labelled=True)]
+
+
 def _warm_up(config: Config, method: Method) -> WarmUp:
-    steps = config.high_level.warmup_env_steps
-    return OfflineWarmUp(steps) if method.offline else RandomWarmUp(steps)
+    high = config.high_level
+    played_first = method.offline or high.initial != "random"
+    return (OfflineWarmUp if played_first else RandomWarmUp)(high.warmup_env_steps)
 
 
 class _Guide(NamedTuple):

@@ -45,7 +45,12 @@ class BuildContext(NamedTuple):
 
 
 def offline_phase(
-    context: BuildContext, name: str, learner: Learner, updates: int, evaluation: Evaluation | None = None
+    context: BuildContext,
+    name: str,
+    learner: Learner,
+    updates: int,
+    evaluation: Evaluation | None = None,
+    labelled: bool = False,
 ) -> OfflinePhase:
     """Return the phase that trains a learner on the data; it leaves the learner's parameters under ``name``."""
-    return OfflinePhase(name, learner, context.normaliser, updates, evaluation)
+    return OfflinePhase(name, learner, context.normaliser, updates, evaluation, labelled)

@@ -130,3 +130,9 @@ def tanh_gaussian_sample(key: jax.Array, mean: jax.Array, log_std: jax.Array) ->
     log_prob = gaussian_log_prob(pre, mean, log_std)
     log_jacobian = jnp.sum(2 * (jnp.log(2.0) - pre - nn.softplus(-2 * pre)), axis=-1)
     return jnp.tanh(pre), log_prob - log_jacobian
+
+
+def tanh_gaussian_log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+    """Return the log density[...] of the squashed Gaussian at action[..., dim], which must lie inside (-1, 1)."""
+    log_jacobian = jnp.sum(jnp.log1p(-(action**2)), axis=-1)
+    return gaussian_log_prob(jnp.arctanh(action), mean, log_std) - log_jacobian

@@ -61,6 +61,7 @@ class OfflinePhase(MemberPhase):
         normaliser: of observations.
         updates: gradient steps.
         evaluation: of a policy, or None.
+        labelled: whether the learner reads the data's labels, which an earlier phase left.
         updates_per_chunk: gradient steps between two looks of the host.
     """
 
@@ -71,12 +72,14 @@ class OfflinePhase(MemberPhase):
         normaliser: Normaliser,
         updates: int,
         evaluation: Evaluation | None = None,
+        labelled: bool = False,
         updates_per_chunk: int = 500,
     ) -> None:
         every = updates if evaluation is None else evaluation.every_updates
         self._updates = min(updates_per_chunk, updates, every)
         super().__init__(name, "pretrain", -(-updates // self._updates))
         self._learner, self._normalise, self._evaluation = learner, normaliser, evaluation
+        self._reads = ("labels",) if labelled else ()
         self._evaluate_every = max(1, round(every / self._updates))
 
     def bind(self, population: Population, data: DeviceData) -> None:
@@ -98,6 +101,10 @@ class OfflinePhase(MemberPhase):
             metrics |= summary(episodes) | {"eval_seconds": time.perf_counter() - started}
         return state, metrics
 
+    def constants(self, artifacts: dict[str, Any]) -> dict[str, Any]:
+        """Return the labels, where the learner reads them."""
+        return {name: artifacts[name] for name in self._reads}
+
     def finish(self, state: OfflinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Return the artifacts with the learner's parameters under the phase's name, and their normaliser."""
         normaliser = self._normalise.repeated(state.update.shape[0])
@@ -114,6 +121,7 @@ class OfflinePhase(MemberPhase):
         self, state: OfflinePhaseState, constants: dict[str, Any], hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[OfflinePhaseState, dict[str, jax.Array]]:
         """Make ``updates_per_chunk`` gradient steps."""
+        data = data.replace(**constants)
 
         def update(learner: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
             return self._learner.update(learner, data, key, hyper)

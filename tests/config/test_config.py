@@ -196,6 +196,10 @@ def test_settings_must_suit_the_method() -> None:
         configs.check_method(load_config("antmaze", "smoke", {**short, "values.estimator": "iql"}))
     with pytest.raises(UserError, match=r"rlpd has no skills.*horizon must stay 1, not 5"):
         configs.check_method(load_config("antmaze", "smoke", {**short, "method": "rlpd"}))
+    with pytest.raises(UserError, match=r"fql is learned offline by its own losses: .*initial must stay random"):
+        configs.check_method(load_config("antmaze", "smoke", {"method": "fql", "high_level.initial": "iql"}))
+    with pytest.raises(UserError, match=r"initial=iql learns from the data's rewards.*must be data, not min"):
+        configs.check_method(load_config("antmaze", "smoke", {"method": "supe", "high_level.initial": "iql"}))
     updates = {"high_level.utd": 10, "high_level.actor_updates": 4}
     with pytest.raises(UserError, match=r"utd \(10\) must be a multiple of high_level\.actor_updates \(4\)"):
         configs.check_method(load_config("antmaze", "smoke", updates))

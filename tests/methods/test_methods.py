@@ -60,6 +60,7 @@ PHASES = {
     "qc-fql": ["agent", "label", "online"],
     "fql": ["agent", "label", "online"],
     "dsrl": ["skills", "online"],
+    "wsrl": ["label", "agent", "online"],
 }
 
 
@@ -108,6 +109,10 @@ def test_published_values() -> None:
     kitchen = {method: configs.from_layers(configs.family_layers("kitchen", method, "paper")) for method in METHODS}
     assert kitchen["supe"].labels.offline_reward == kitchen["hilp"].labels.offline_reward == "pred"
     assert (kitchen["diffusion-jsrl"].guide.ratio, kitchen["iql"].values.expectile) == (0.75, 0.7)
+    warm = maze["wsrl"].high_level
+    assert (warm.warmup_env_steps, warm.ensemble, warm.target_subset, warm.utd) == (5_000, 10, 2, 4)
+    assert (warm.offline_fraction, warm.batch_size, maze["wsrl"].flow.updates) == (0.0, 256, 1_000_000)
+    assert (kitchen["wsrl"].values.expectile, kitchen["wsrl"].flow.updates) == (0.7, 250_000)
 
 
 def test_a_flat_method_refuses_skills() -> None:
@@ -127,6 +132,12 @@ def fewest_steps(start: np.ndarray) -> int:
     raise AssertionError
 
 
+def mean_fewest_steps() -> float:
+    """Of starts as the task draws them."""
+    starts = 0.1 * np.random.default_rng(0).normal(size=(1000, 2))
+    return float(np.mean([fewest_steps(start) for start in starts]))
+
+
 def test_rlpd_reaches_the_optimum_of_the_plane() -> None:
     config = config_of(
         "rlpd",
@@ -144,8 +155,7 @@ def test_rlpd_reaches_the_optimum_of_the_plane() -> None:
     for phase in phases_of(config, point_dataset()):
         _, history, artifacts = run_phase(phase, jax.random.split(jax.random.key(0), 1), artifacts)
         metrics = history[-1]
-    starts = 0.1 * np.random.default_rng(0).normal(size=(1000, 2))
-    best = np.mean([fewest_steps(start) for start in starts])
+    best = mean_fewest_steps()
     assert 8 < best < 10
     assert metrics["eval/success"][0] == 1.0
     assert metrics["eval/length"][0] < best + 1.0

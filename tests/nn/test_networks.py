@@ -30,6 +30,7 @@ def test_tanh_gaussian_density_integrates_like_the_change_of_variables():
     pre = np.arctanh(float(u[0]))
     expected = scipy.stats.norm.logpdf(pre, 0.3, np.exp(-0.2)) - np.log(1 - float(u[0]) ** 2)
     np.testing.assert_allclose(log_prob, expected, rtol=1e-4)
+    np.testing.assert_allclose(networks.tanh_gaussian_log_prob(u, mean, log_std), expected, rtol=1e-4)
 
 
 def test_tanh_gaussian_log_prob_is_finite_in_the_corners():
