@@ -13,7 +13,6 @@ from qdos_brax.nn.networks import MLP
 
 Params = Any
 
-
 _SMALLEST_SCALE = 1e-3  # of a number that never changes; what is seen has deviation 1
 
 
@@ -44,9 +43,9 @@ class ForwardModel:
         """Return what is seen[..., seen] after action[..., act]."""
         return seen + self._scale * self._net.apply(params, jnp.concatenate([seen, action], axis=-1))
 
-    def loss(self, params: Params, seen: jax.Array, action: jax.Array, after: jax.Array) -> jax.Array:
-        """Return the mean squared error of the change, in units of ``scale``."""
-        return jnp.mean(((self.predict(params, seen, action) - after) / self._scale) ** 2)
+    def error(self, params: Params, seen: jax.Array, action: jax.Array, after: jax.Array) -> jax.Array:
+        """Return the mean squared error of the change, [...], in units of ``scale``."""
+        return jnp.mean(((self.predict(params, seen, action) - after) / self._scale) ** 2, axis=-1)
 
     def follow(
         self,

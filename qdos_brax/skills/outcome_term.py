@@ -123,16 +123,15 @@ class OutcomeTerm:
         index = jax.random.randint(skill_key, (_ROWS,), 0, filled)
         some = jax.tree.map(lambda leaf: leaf[index], state.memory)
         seen = self._model.see_along(params, segments.observations)
-        rows = jax.tree.map(
-            lambda *both: jnp.concatenate(both),
-            _steps(step_key, some.seen, some.actions),
-            _steps(data_key, seen, segments.actions),
-        )
+        valid = some.weight > 0  # not of a simulation that broke
+        played, played_from = _steps(step_key, some.seen, some.actions)
+        logged, _ = _steps(data_key, seen, segments.actions)
 
         def loss(learned: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
             error = self.error(learned["encoder"], some.seen[:, 0], some.seen[:, -1], some.place, noise_key)
-            encoder_loss = jnp.mean(jnp.where(some.weight > 0, error, 0.0))
-            model_loss = self._forward.loss(learned["model"], *rows)
+            encoder_loss = jnp.mean(jnp.where(valid, error, 0.0))
+            played_loss = jnp.mean(jnp.where(valid[played_from], self._forward.error(learned["model"], *played), 0.0))
+            model_loss = (played_loss + jnp.mean(self._forward.error(learned["model"], *logged))) / 2
             return encoder_loss + model_loss, {"outcome_loss": encoder_loss, "forward_model_loss": model_loss}
 
         grads, info = jax.grad(loss, has_aux=True)(state.params)
@@ -158,9 +157,13 @@ class OutcomeTerm:
         return jnp.clip(self._model.decode_seen(params, seen, latent)[0], -1.0, 1.0)
 
 
-def _steps(key: jax.Array, seen: jax.Array, actions: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return ``_ROWS`` random steps (before, action, after) of seen[B, T, seen] and actions[B, >= T - 1, act]."""
+def _steps(
+    key: jax.Array, seen: jax.Array, actions: jax.Array
+) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
+    """Return ``_ROWS`` random steps (before, action, after) of seen[B, T, seen] and actions[B, >= T - 1, act], and in
+    which of the B each is.
+    """
     which, when = jax.random.split(key)
     row = jax.random.randint(which, (_ROWS,), 0, seen.shape[0])
     time = jax.random.randint(when, (_ROWS,), 0, seen.shape[1] - 1)
-    return seen[row, time], actions[row, time], seen[row, time + 1]
+    return (seen[row, time], actions[row, time], seen[row, time + 1]), row
