@@ -149,6 +149,9 @@ def check_method(config: Config) -> None:
 
 _AS_BEFORE = {
     ("skills", "view"): "world",
+    ("skills", "effective_share"): 0.5,
+    ("skills", "alpha_error"): 0.25,
+    ("skills", "alpha_rate"): 0.001,
     ("high_level", "actor_updates"): 1,
     ("high_level", "initial"): "random",
     ("labels", "latent"): "sample",

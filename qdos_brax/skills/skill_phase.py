@@ -13,13 +13,16 @@ import numpy as np
 import optax
 from flax import struct
 
-from qdos_brax.config import Config, SkillsConfig
+from qdos_brax.config import Config, SkillsConfig, asks_auto
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import window
 from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.population import health
+from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
+from qdos_brax.skills.alpha import AdaptiveAlpha, Alpha, FixedAlpha
 from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
+from qdos_brax.skills.temperature import effective_share, member_temperature
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
 
@@ -48,6 +51,7 @@ class SkillPhaseState(struct.PyTreeNode):
         params: of the skill model.
         opt_state: Adam's, of ``params``.
         weights: what the segment weights learn.
+        alpha: what the weight of the mutual-information loss carries.
         update: gradient steps so far.
         broken: rollouts whose simulation broke; they are left out.
         healthy: False once a number that is learned stopped being finite; the member is frozen from then on.
@@ -57,6 +61,7 @@ class SkillPhaseState(struct.PyTreeNode):
     params: Any
     opt_state: optax.OptState
     weights: Any
+    alpha: Any
     update: jax.Array
     broken: jax.Array
     healthy: jax.Array
@@ -89,13 +94,25 @@ class SkillPhase(MemberPhase):
         self._skills: SkillsConfig = config.skills
         self._view = view
         self._model, self._weights, self._information = model, weights, information
+        self._alpha: Alpha = AdaptiveAlpha() if asks_auto(config.skills.alpha) else FixedAlpha()
+        self._finds_temperature = asks_auto(config.skills.advantage_temperature)
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
         self._blocks = min(blocks_per_chunk, total_blocks)
         super().__init__("skills", "pretrain", -(-total_blocks // self._blocks))
 
+    def bind(self, population: Population, data: DeviceData) -> None:
+        """Compile the programs, that of the weights' temperature included."""
+        super().bind(population, data)
+        self._temperatures = population.program(lambda advantage, hyper, _: member_temperature(advantage, hyper))
+
     def constants(self, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Return the segments' advantages, where values were learned."""
-        return {name: artifacts[name] for name in ("advantage",) if name in artifacts}
+        """Return the segments' advantages, where values were learned, and the temperature that was found for them."""
+        if "advantage" not in artifacts:
+            return {}
+        advantage = artifacts["advantage"]
+        if not self._finds_temperature:
+            return {"advantage": advantage}
+        return {"advantage": advantage, "temperature": self._temperatures(advantage, self.hyper, self.data)}
 
     def metrics(self, state: SkillPhaseState, info: dict[str, np.ndarray]) -> dict[str, Any]:
         """Return the columns of metrics.csv after a chunk, [members] each."""
@@ -116,6 +133,7 @@ class SkillPhase(MemberPhase):
             params=params,
             opt_state=ADAM.init(params),
             weights=self._weights.init(weights_key),
+            alpha=self._alpha.start(),
             update=jnp.zeros((), jnp.int32),
             broken=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),
@@ -129,8 +147,10 @@ class SkillPhase(MemberPhase):
         block = partial(self._block, data=data, hyper=hyper, artifacts=constants)
         after, info = jax.lax.scan(block, state, keys[1:])
         learned, healthy = health.keep_finite(state.healthy, _learned(after), _learned(state))
-        params, opt_state, weights = learned
-        state = after.replace(key=keys[0], params=params, opt_state=opt_state, weights=weights, healthy=healthy)
+        params, opt_state, weights, alpha = learned
+        state = after.replace(
+            key=keys[0], params=params, opt_state=opt_state, weights=weights, alpha=alpha, healthy=healthy
+        )
         return state, jax.tree.map(jnp.mean, info)
 
     def _block(
@@ -150,7 +170,9 @@ class SkillPhase(MemberPhase):
             finite = jnp.all(jnp.isfinite(observations), axis=(1, 2))
             observations = jnp.where(finite[:, None, None], observations, 0.0)
             rollout = Rollout(observations, latent, jnp.where(finite, weight, 0.0))
-            state = state.replace(broken=state.broken + jnp.sum(~finite).astype(jnp.int32))
+            error = partial(self._model.information_error, state.params, *rollout, hyper["skills.latent_box"])
+            alpha = self._alpha.after_rollouts(state.alpha, error, self._skills.mi_every, hyper)
+            state = state.replace(alpha=alpha, broken=state.broken + jnp.sum(~finite).astype(jnp.int32))
         update = partial(self._update, data=data, hyper=hyper, artifacts=artifacts, rollout=rollout)
         return jax.lax.scan(update, state, jax.random.split(update_key, self._skills.mi_every))
 
@@ -171,13 +193,16 @@ class SkillPhase(MemberPhase):
             if rollout is None:
                 return total, info
             information_loss = self._model.information_loss(params, *rollout)
-            return total + hyper["skills.alpha"] * information_loss, info | {"information_loss": information_loss}
+            info = info | {"information_loss": information_loss} | self._alpha.metrics(state.alpha, hyper)
+            return total + self._alpha.weight(state.alpha, hyper) * information_loss, info
 
         grads, info = jax.grad(loss, has_aux=True)(state.params)
         params, opt_state = adam_step(state.params, state.opt_state, grads, hyper["skills.learning_rate"])
-        effective = jnp.sum(weight) ** 2 / jnp.sum(weight**2) / self._skills.batch_size
+        info = info | {"weight_ess": effective_share(weight)}
+        if "temperature" in artifacts:
+            info = info | {"weight_temperature": artifacts["temperature"]}
         state = state.replace(params=params, opt_state=opt_state, update=state.update + 1)
-        return state, info | {"weight_ess": effective}
+        return state, info
 
     def _segments(self, data: DeviceData, index: jax.Array) -> Segments:
         return Segments(*window((data.observations, data.actions), data.starts[index], self._skills.horizon))
@@ -190,8 +215,9 @@ class SkillPhase(MemberPhase):
 
     def _weight(self, state: SkillPhaseState, batch: SegmentBatch, artifacts: Any, hyper: Any) -> jax.Array:
         advantage = self._weights.advantage(state.weights, batch, artifacts)
-        return advantage_weights(advantage, hyper["skills.advantage_temperature"], hyper["skills.weight_clip"])
+        temperature = artifacts.get("temperature", hyper["skills.advantage_temperature"])
+        return advantage_weights(advantage, temperature, hyper["skills.weight_clip"])
 
 
-def _learned(state: SkillPhaseState) -> tuple[Any, Any, Any]:
-    return state.params, state.opt_state, state.weights
+def _learned(state: SkillPhaseState) -> tuple[Any, Any, Any, Any]:
+    return state.params, state.opt_state, state.weights, state.alpha

@@ -141,6 +141,21 @@ class SkillModel:
         recovered = self.encode(params, Segments(observations, actions)).mean
         return jnp.mean(weight * jnp.sum((recovered - latent) ** 2, axis=-1))
 
+    def information_error(
+        self,
+        params: dict[str, Params],
+        observations: jax.Array,
+        latent: jax.Array,
+        weight: jax.Array,
+        box: jax.Array | float,
+    ) -> jax.Array:
+        """Return L_info over what it is where nothing of z, uniform in [-box, box]^d, can be read back: d box^2 / 3.
+
+        Arguments as for ``information_loss``; the weights' mean is divided out.
+        """
+        blind = jnp.mean(weight) * self.latent_dim * box**2 / 3
+        return self.information_loss(params, observations, latent, weight) / jnp.maximum(blind, 1e-6)
+
     def _pose(self, params: dict[str, Params], observation: jax.Array) -> jax.Array:
         return self.view.pose(params.get("view", {}), observation)
 
