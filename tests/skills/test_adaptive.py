@@ -91,7 +91,8 @@ def test_a_scan_may_mix_numbers_and_auto() -> None:
     advantage = jnp.tile(normal_scores(jax.random.normal(jax.random.key(0), data.starts.shape)), (2, 1))
     state, history, _ = run_phase(phase, jax.random.split(jax.random.key(1), 2), {"advantage": advantage})
     alpha, error = history[-1]["information_weight"], history[-1]["information_error"]
-    assert alpha[0] == np.float32(0.3) and alpha[1] != np.float32(0.2) and np.isfinite(error).all()
+    np.testing.assert_allclose(alpha[0], 0.3, rtol=1e-5)  # a mean over the chunk's steps
+    assert abs(alpha[1] - 0.2) > 1e-3 and np.isfinite(error).all()
     np.testing.assert_allclose(history[-1]["weight_temperature"], 1 / np.sqrt(np.log(2)), rtol=0.1)
     assert np.all(np.isfinite(state.alpha["log_alpha"])) and state.update.tolist() == [20, 20]
 
