@@ -108,5 +108,6 @@ def with_alpha(method: str, alpha: Any) -> str:
 
 
 def listed(values: Any) -> str:
-    """Return one number, or several separated by commas."""
-    return ", ".join(f"{value:g}" for value in (values if isinstance(values, tuple) else (values,)))
+    """Return one number or text, or several separated by commas."""
+    each = values if isinstance(values, tuple) else (values,)
+    return ", ".join(value if isinstance(value, str) else f"{value:g}" for value in each)

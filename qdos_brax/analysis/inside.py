@@ -21,6 +21,7 @@ from qdos_brax.data.device import DeviceData, Normaliser, to_device
 from qdos_brax.data.segments import window
 from qdos_brax.files import write_arrays
 from qdos_brax.methods.low_level_kinds import make_low_level
+from qdos_brax.skills.temperature import member_temperature
 from qdos_brax.skills.vae import Segments
 from qdos_brax.skills.weights import advantage_weights
 
@@ -143,8 +144,8 @@ def _truth(trained: TrainedRun, sample: _Sample) -> Arrays:
 def _weights(trained: TrainedRun, member: int, sample: _Sample) -> Arrays:
     if "advantage" not in trained.artifacts:
         return {}
-    temperature, clip = (trained.hyper[f"skills.{name}"][member] for name in ("advantage_temperature", "weight_clip"))
-    weights = advantage_weights(trained.artifacts["advantage"][member], temperature, clip)
+    advantage, hyper = trained.artifacts["advantage"][member], {key: x[member] for key, x in trained.hyper.items()}
+    weights = advantage_weights(advantage, member_temperature(advantage, hyper), hyper["skills.weight_clip"])
     return {"weight": np.asarray(weights)[sample.chosen]}
 
 

@@ -97,6 +97,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.video and len(args.runs) > 1:
         raise UserError(f"--video films one run, and {len(args.runs)} were given; name one RUN")
 
+    from qdos_brax.analysis.conclusion import listed
     from qdos_brax.analysis.finished import evaluate_run
     from qdos_brax.runs.jax_setup import prepare_jax
 
@@ -108,7 +109,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         print(f"{args.video}: " + ", ".join(f"{name} {value:g}" for name, value in episode.items()), flush=True)
     for run in args.runs:
         for member in evaluate_run(Path(run), args.episodes):
-            print(f"{run}: " + ", ".join(f"{name} {value:g}" for name, value in member.items()))
+            print(f"{run}: " + ", ".join(f"{name} {listed(value)}" for name, value in member.items()))
     return 0
 
 

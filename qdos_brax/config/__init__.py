@@ -30,7 +30,7 @@ from qdos_brax.config.load import (
 from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig
 from qdos_brax.config.rules import nearest
 from qdos_brax.config.run_groups import RunConfig, ScanConfig
-from qdos_brax.config.scan import hyper_tree, members, population_hyper, values_by_key
+from qdos_brax.config.scan import asks_auto, hyper_tree, is_auto, members, population_hyper, values_by_key
 from qdos_brax.config.schema import Config, plain
 from qdos_brax.config.skill_groups import DataConfig, SkillsConfig, ValuesConfig
 
@@ -50,6 +50,7 @@ __all__ = [
     "ScanConfig",
     "SkillsConfig",
     "ValuesConfig",
+    "asks_auto",
     "check_method",
     "config_hash",
     "default_preset",
@@ -59,6 +60,7 @@ __all__ = [
     "from_plain",
     "from_yaml",
     "hyper_tree",
+    "is_auto",
     "load_config",
     "load_programs",
     "members",

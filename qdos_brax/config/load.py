@@ -151,6 +151,9 @@ _AS_BEFORE = {
     ("skills", "view"): "world",
     ("skills", "mi_encoder"): "segment",
     ("skills", "mi_latent"): "box",
+    ("skills", "effective_share"): 0.5,
+    ("skills", "alpha_error"): 0.25,
+    ("skills", "alpha_rate"): 0.001,
     ("high_level", "actor_updates"): 1,
     ("high_level", "initial"): "random",
     ("labels", "latent"): "sample",
@@ -232,6 +235,14 @@ def _check_together(config: Config) -> None:
         )
     if config.skills.advantage == "transition" and config.values.estimator == "graph":
         raise UserError("skills.advantage=transition needs values.estimator=iql; on a graph it is the same as segment")
+    if scan.asks_auto(config.skills.alpha) and (config.skills.mi_encoder, config.skills.mi_latent) == (
+        "segment",
+        "played",
+    ):
+        raise UserError(
+            "skills.alpha=auto with skills.mi_encoder=segment needs skills.mi_latent=box: it asks how much of a latent "
+            "of known spread can be read back"
+        )
     if config.skills.mi_encoder == "outcome" and config.skills.mi_rollout != "physics":
         raise UserError("skills.mi_encoder=outcome needs skills.mi_rollout=physics: logged states are no outcome of z")
     if config.skills.mi_encoder == "outcome" and config.skills.view == "body":

@@ -14,6 +14,7 @@ import yaml
 from qdos_brax.errors import UserError
 
 MAX_COUNT = 2**31 - 1
+AUTO = "auto"  # where a field accepts it: the number is found while training
 _PLAIN_KINDS = {"bool": "true or false", "text": "text", "path": "path"}
 _NUMBER_KINDS = {
     "int": "whole number",
@@ -33,6 +34,7 @@ class Rule:
         high: largest value accepted.
         above: whether ``low`` itself is refused.
         choices: the only texts accepted; empty for any.
+        auto: whether ``AUTO`` is accepted in a number's place.
     """
 
     kind: str
@@ -40,6 +42,7 @@ class Rule:
     high: float = math.inf
     above: bool = False
     choices: tuple[str, ...] = ()
+    auto: bool = False
 
 
 def field(
@@ -73,9 +76,10 @@ def number(
     above: bool = False,
     scan: bool = True,
     label: str = "",
+    auto: bool = False,
 ) -> Any:
-    """Return a field for a real number in [low, high], or in (low, high] if ``above``."""
-    return field(default, meaning, Rule("float", low, high, above), scan=scan, label=label)
+    """Return a field for a real number in [low, high], or in (low, high] if ``above``; or ``AUTO``, if ``auto``."""
+    return field(default, meaning, Rule("float", low, high, above, auto=auto), scan=scan, label=label)
 
 
 def rate(default: float, meaning: str = "Adam learning rate") -> Any:
@@ -104,7 +108,7 @@ def describe(rule: Rule) -> str:
         return f"one of {', '.join(rule.choices)}"
     if rule.kind in _PLAIN_KINDS:
         return _PLAIN_KINDS[rule.kind]
-    return f"{_NUMBER_KINDS[rule.kind]}, {_range(rule)}"
+    return f"{_NUMBER_KINDS[rule.kind]}, {_range(rule)}" + (f", or {AUTO}" if rule.auto else "")
 
 
 def convert(key: str, value: Any, leaf: dataclasses.Field[Any]) -> Any:
@@ -128,10 +132,14 @@ def convert(key: str, value: Any, leaf: dataclasses.Field[Any]) -> Any:
     if isinstance(value, list | tuple) or len(items) > 1:
         if not leaf.metadata["scan"]:
             raise UserError(f"{key} takes one value, not a list: it shapes the program and cannot be scanned")
-        numbers = tuple(_number_in(key, item, rule) for item in _some(key, items))
-        return numbers if len(numbers) > 1 else numbers[0]
-    single = _number_in(key, value, rule, whole=rule.kind == "int")
-    return int(single) if rule.kind == "int" else single
+        listed = listed_in(key, value, rule)
+        return listed if len(listed) > 1 else listed[0]
+    return int(_number_in(key, value, rule, whole=True)) if rule.kind == "int" else _number_or_auto(key, value, rule)
+
+
+def listed_in(key: str, value: Any, rule: Rule) -> tuple[float | str, ...]:
+    """Return what ``value`` lists, or its one entry, each within the rule."""
+    return tuple(_number_or_auto(key, item, rule) for item in _some(key, _items(value)))
 
 
 def values_in(key: str, value: Any, whole: bool = False) -> tuple[float, ...]:
@@ -182,9 +190,13 @@ def _some(key: str, items: list[Any]) -> list[Any]:
     return items
 
 
+def _number_or_auto(key: str, value: Any, rule: Rule) -> float | str:
+    return AUTO if rule.auto and isinstance(value, str) and value.strip() == AUTO else _number_in(key, value, rule)
+
+
 def _number_in(key: str, value: Any, rule: Rule, whole: bool = False) -> float:
     """Return ``value`` as a number in the rule's range; it may be a text such as "1e5", which YAML takes for a text."""
-    kind = "a whole number" if whole else "a number"
+    kind = "a whole number" if whole else "a number or auto" if rule.auto else "a number"
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise UserError(f"{key} must be {kind}, not {value!r}")
     try:

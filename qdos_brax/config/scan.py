@@ -11,13 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from qdos_brax.config.rules import values_in
+from qdos_brax.config.rules import AUTO, Rule, listed_in, values_in
 from qdos_brax.config.run_groups import ScanConfig
 from qdos_brax.config.schema import Config, get, labelled, leaves
 from qdos_brax.errors import UserError
 
 _DISTRIBUTION = re.compile(r"\s*(\w+)\s*\(([^(),]*),([^(),]*)\)\s*")
 _DRAWS_PER_SETTING = 100
+_AUTO_NUMBER = -1.0  # what ``AUTO`` is among a member's numbers: the fields that accept it have none below 0
+
+
+def is_auto(number: Any) -> Any:
+    """Return whether a number of ``hyper_tree`` (or each of an array) stands for auto."""
+    return number == _AUTO_NUMBER
+
+
+def asks_auto(value: Any) -> bool:
+    """Return whether a field's value is auto, or a list with it."""
+    return AUTO in (value if isinstance(value, tuple) else (value,))
 
 
 def hyper_tree(config: Config, member: Mapping[str, Any] | None = None) -> dict[str, float]:
@@ -37,7 +48,7 @@ def hyper_tree(config: Config, member: Mapping[str, Any] | None = None) -> dict[
             value = chosen.get(key, get(config, key))
             if isinstance(value, tuple):
                 raise UserError(f"{key} holds {len(value)} values where one is wanted")
-            tree[key] = float(value)
+            tree[key] = _AUTO_NUMBER if value == AUTO else float(value)
     return tree
 
 
@@ -92,7 +103,7 @@ def check(config: Config) -> None:
         rows = list(_pairs(several))
         for row in rows:
             if rows.count(row) > 1:
-                raise UserError(f"--zip makes the same member twice: {', '.join(f'{k} {v:g}' for k, v in row)}")
+                raise UserError(f"--zip makes the same member twice: {', '.join(f'{k} {v}' for k, v in row)}")
         return
     for key, values in several.items():
         if len(set(values)) < len(values):
@@ -122,16 +133,16 @@ def drawn(values: Mapping[str, Any]) -> dict[str, Any]:
     if values.get("scan.combine", ScanConfig.combine) != ScanConfig.combine:
         raise UserError("--sample draws its own settings; leave out --zip")
     seed = int(values_in("scan.draw_seed", values.get("scan.draw_seed", 0), whole=True)[0])
-    streams = {}
+    streams: dict[str, Iterator[float | str]] = {}
     for key in scannable:
         stream = np.random.default_rng([seed, zlib.crc32(key.encode())])
         if key in wanted:
             streams[key] = _draws(*wanted[key], stream)
-        elif len(listed := values_in(key, values[key])) > 1:
+        elif len(listed := listed_in(key, values[key], Rule("float", auto=True))) > 1:
             streams[key] = _choices(listed, stream)
     if not streams:
         raise UserError("--sample has nothing to draw; give a key as --set 'skills.alpha=loguniform(0.1,3)' or a list")
-    settings: dict[tuple[float, ...], None] = {}
+    settings: dict[tuple[float | str, ...], None] = {}
     for _ in range(_DRAWS_PER_SETTING * int(count)):
         if len(settings) == count:
             break
@@ -189,6 +200,6 @@ def _draws(name: str, low: float, high: float, stream: np.random.Generator) -> I
         yield min(max(float(f"{number:.6g}"), low), high)
 
 
-def _choices(values: tuple[float, ...], stream: np.random.Generator) -> Iterator[float]:
+def _choices(values: tuple[float | str, ...], stream: np.random.Generator) -> Iterator[float | str]:
     while True:
         yield values[stream.integers(len(values))]

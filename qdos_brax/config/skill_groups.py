@@ -7,6 +7,7 @@ import dataclasses
 from qdos_brax.config.rules import choice, count, flag, number, rate, widths
 
 Scannable = float | tuple[float, ...]
+ScannableOrAuto = float | str | tuple[float | str, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,11 +103,25 @@ class SkillsConfig:
         "rank",
         "std",
     )
-    advantage_temperature: Scannable = number(1.0, "lambda in the weights exp(A / lambda)", above=True)
-    weight_clip: Scannable = number(20.0, "largest weight, after the batch's weights are scaled to mean 1", low=1.0)
-    alpha: Scannable = number(
-        0.2, "weight of the mutual-information loss; methods without that loss run with 0", label="alpha"
+    advantage_temperature: ScannableOrAuto = number(
+        1.0, "lambda in the weights exp(A / lambda); auto finds it from effective_share", above=True, auto=True
     )
+    effective_share: Scannable = number(
+        0.5, "(advantage_temperature auto) effective sample size of the weights over their number", high=1.0, above=True
+    )
+    weight_clip: Scannable = number(20.0, "largest weight, after the batch's weights are scaled to mean 1", low=1.0)
+    alpha: ScannableOrAuto = number(
+        0.2,
+        "weight of the mutual-information loss; auto adapts it to alpha_error; methods without that loss run with 0",
+        label="alpha",
+        auto=True,
+    )
+    alpha_error: Scannable = number(
+        0.25,
+        "(alpha auto) share of the variance of z that may be lost between a random skill and what it does",
+        high=1.0,
+    )
+    alpha_rate: Scannable = number(0.001, "(alpha auto) ascent of log alpha per gradient step and unit of error")
     mi_rollout: str = choice(
         "physics",
         "where skills are rolled out for the mutual-information loss: physics (the simulator) or logged (the policy "

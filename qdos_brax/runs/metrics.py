@@ -195,13 +195,24 @@ def _text(columns: Sequence[str], rows: Sequence[Row]) -> str:
 
 
 def _cell(value: Any) -> str:
-    """Return a number as text: whole numbers exactly, others with the nine digits that identify a float32."""
+    """Return a number as text: whole numbers exactly, others with the nine digits that identify a float32.
+
+    A text (a member's "auto") stays as it is.
+    """
+    if isinstance(value, str):
+        return value
     number = np.asarray(value).item()
     return str(int(number)) if isinstance(number, int | bool) else f"{number:.9g}"
 
 
-def _plain(text: str) -> float | int:
-    return int(text) if text.lstrip("-").isdigit() else float(text)
+def _plain(text: str) -> float | int | str:
+    """Return a member's cell as it was."""
+    if text.lstrip("-").isdigit():
+        return int(text)
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _or_none(numbers: Mapping[str, float], name: str) -> float | None:

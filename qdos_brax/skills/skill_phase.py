@@ -13,15 +13,18 @@ import numpy as np
 import optax
 from flax import struct
 
-from qdos_brax.config import Config, SkillsConfig
+from qdos_brax.config import Config, SkillsConfig, asks_auto
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import window
 from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.population import health
+from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
+from qdos_brax.skills.alpha import AdaptiveAlpha, Alpha, FixedAlpha, unreadable_share
 from qdos_brax.skills.information_terms import InformationTerm, Rollout
 from qdos_brax.skills.latent_map import Prior, latent_map
 from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
+from qdos_brax.skills.temperature import effective_share, member_temperature
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
 
@@ -35,6 +38,7 @@ class SkillPhaseState(struct.PyTreeNode):
         opt_state: Adam's, of ``params``.
         weights: what the segment weights learn.
         information: what the mutual-information term learns and remembers by itself.
+        alpha: what the weight of the mutual-information loss carries.
         update: gradient steps so far.
         broken: rollouts whose simulation broke; they are left out.
         healthy: False once a number that is learned stopped being finite; the member is frozen from then on.
@@ -45,6 +49,7 @@ class SkillPhaseState(struct.PyTreeNode):
     opt_state: optax.OptState
     weights: Any
     information: Any
+    alpha: Any
     update: jax.Array
     broken: jax.Array
     healthy: jax.Array
@@ -79,13 +84,25 @@ class SkillPhase(MemberPhase):
         # The map by which random skills are drawn: an absolute box, or where the high level plays.
         self._drawn = "box" if config.skills.mi_latent == "box" else config.high_level.latent_map
         self._model, self._weights, self._information = model, weights, information
+        self._alpha: Alpha = AdaptiveAlpha() if asks_auto(config.skills.alpha) else FixedAlpha()
+        self._finds_temperature = asks_auto(config.skills.advantage_temperature)
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
         self._blocks = min(blocks_per_chunk, total_blocks)
         super().__init__("skills", "pretrain", -(-total_blocks // self._blocks))
 
+    def bind(self, population: Population, data: DeviceData) -> None:
+        """Compile the programs, that of the weights' temperature included."""
+        super().bind(population, data)
+        self._temperatures = population.program(lambda advantage, hyper, _: member_temperature(advantage, hyper))
+
     def constants(self, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Return the segments' advantages, where values were learned."""
-        return {name: artifacts[name] for name in ("advantage",) if name in artifacts}
+        """Return the segments' advantages, where values were learned, and the temperature that was found for them."""
+        if "advantage" not in artifacts:
+            return {}
+        advantage = artifacts["advantage"]
+        if not self._finds_temperature:
+            return {"advantage": advantage}
+        return {"advantage": advantage, "temperature": self._temperatures(advantage, self.hyper, self.data)}
 
     def metrics(self, state: SkillPhaseState, info: dict[str, np.ndarray]) -> dict[str, Any]:
         """Return the columns of metrics.csv after a chunk, [members] each."""
@@ -107,6 +124,7 @@ class SkillPhase(MemberPhase):
             opt_state=ADAM.init(params),
             weights=self._weights.init(weights_key),
             information={} if self._information is None else self._information.init(jax.random.fold_in(key, 0)),
+            alpha=self._alpha.start(),
             update=jnp.zeros((), jnp.int32),
             broken=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),
@@ -133,6 +151,8 @@ class SkillPhase(MemberPhase):
             state, rollout = self._roll_out(state, rollout_key, latent_key, data, hyper, artifacts)
             information, played = self._information.receive(state.information, state.params, rollout)
             state = state.replace(information=information)
+            error = partial(self._unreadable, state, played, rollout.weight, rollout_key, hyper)
+            state = state.replace(alpha=self._alpha.after_rollouts(state.alpha, error, self._skills.mi_every, hyper))
         update = partial(self._update, data=data, hyper=hyper, artifacts=artifacts, played=played)
         return jax.lax.scan(update, state, jax.random.split(update_key, self._skills.mi_every))
 
@@ -160,6 +180,14 @@ class SkillPhase(MemberPhase):
         rollout = Rollout(observations, latent, half_side * action, jnp.where(finite, weight, 0.0))
         return state.replace(broken=state.broken + jnp.sum(~finite).astype(jnp.int32)), rollout
 
+    def _unreadable(
+        self, state: SkillPhaseState, played: Any, weight: jax.Array, key: jax.Array, hyper: Any
+    ) -> jax.Array:
+        """Return the share of a random skill's variance that cannot be read back from what it did."""
+        assert self._information is not None
+        loss = self._information.loss(state.params, state.information, played, key)
+        return unreadable_share(loss, weight, hyper["skills.latent_box"], self._skills.latent_dim)
+
     def _update(
         self, state: SkillPhaseState, key: jax.Array, data: DeviceData, hyper: Any, artifacts: Any, played: Any
     ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
@@ -179,13 +207,16 @@ class SkillPhase(MemberPhase):
             if self._information is None:
                 return total, info
             information_loss = self._information.loss(params, state.information, played, loss_key)
-            return total + hyper["skills.alpha"] * information_loss, info | {"information_loss": information_loss}
+            info = info | {"information_loss": information_loss} | self._alpha.metrics(state.alpha, hyper)
+            return total + self._alpha.weight(state.alpha, hyper) * information_loss, info
 
         grads, info = jax.grad(loss, has_aux=True)(state.params)
         params, opt_state = adam_step(state.params, state.opt_state, grads, hyper["skills.learning_rate"])
-        effective = jnp.sum(weight) ** 2 / jnp.sum(weight**2) / self._skills.batch_size
+        info = info | {"weight_ess": effective_share(weight)}
+        if "temperature" in artifacts:
+            info = info | {"weight_temperature": artifacts["temperature"]}
         state = state.replace(params=params, opt_state=opt_state, update=state.update + 1)
-        return state, info | found | {"weight_ess": effective}
+        return state, info | found
 
     def _learn_information(
         self, state: SkillPhaseState, segments: Segments, key: jax.Array
@@ -206,8 +237,9 @@ class SkillPhase(MemberPhase):
 
     def _weight(self, state: SkillPhaseState, batch: SegmentBatch, artifacts: Any, hyper: Any) -> jax.Array:
         advantage = self._weights.advantage(state.weights, batch, artifacts)
-        return advantage_weights(advantage, hyper["skills.advantage_temperature"], hyper["skills.weight_clip"])
+        temperature = artifacts.get("temperature", hyper["skills.advantage_temperature"])
+        return advantage_weights(advantage, temperature, hyper["skills.weight_clip"])
 
 
 def _learned(state: SkillPhaseState) -> dict[str, Any]:
-    return {name: getattr(state, name) for name in ("params", "opt_state", "weights", "information")}
+    return {name: getattr(state, name) for name in ("params", "opt_state", "weights", "information", "alpha")}
