@@ -131,6 +131,8 @@ def check_method(config: Config) -> None:
         raise UserError(
             f"{config.method} holds its actor near the data by itself: high_level.regulariser must stay entropy"
         )
+    if config.tuning.skills != "off" and method.low_level != "trajectory":
+        raise UserError(f"{config.method} has no trajectory skills to fine-tune: tuning.skills must stay off")
     if high.utd % high.actor_updates:
         raise UserError(
             f"high_level.utd ({high.utd}) must be a multiple of high_level.actor_updates ({high.actor_updates}): the "
@@ -146,7 +148,7 @@ _AS_BEFORE = {
     ("labels", "latent"): "sample",
     ("labels", "inputs"): "normalised",
 }
-_GROUPS_AS_BEFORE = ("scan", "flow")  # left out if they have their defaults
+_GROUPS_AS_BEFORE = ("scan", "flow", "tuning")  # left out if they have their defaults
 
 
 def config_hash(config: Config) -> str:
