@@ -64,11 +64,15 @@ class PointEnv(Env):
         )
 
 
-def point_dataset(episodes: int = 200, length: int = 30, seed: int = 0, spread: float = np.pi) -> Dataset:
+def point_dataset(
+    episodes: int = 200, length: int = 30, seed: int = 0, spread: float = np.pi, speed: float = 0.9
+) -> Dataset:
     """Straight walks in directions within ``spread`` of +x that change every 15 steps, from random starts."""
     rng = np.random.default_rng(seed)
     angles = np.repeat(rng.uniform(-spread, spread, (episodes, length // 15)), 15, axis=1)
-    actions = np.stack([np.cos(angles), np.sin(angles)], axis=-1) * 0.9 + 0.05 * rng.normal(size=(episodes, length, 2))
+    actions = np.stack([np.cos(angles), np.sin(angles)], axis=-1) * speed + 0.05 * rng.normal(
+        size=(episodes, length, 2)
+    )
     actions = np.clip(actions, -1, 1).astype(np.float32)
     start = rng.uniform(-1.0, 1.0, (episodes, 1, 2))
     positions = np.concatenate([start, start + STEP * np.cumsum(actions, axis=1)], axis=1).astype(np.float32)

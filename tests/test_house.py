@@ -37,11 +37,11 @@ EVERYWHERE = {"errors", "files"}
 TOP_FILES, FILE_LINES = 6, 330
 # What public docstrings begin with; a verb that is missing here may be added.
 VERBS = frozenset(re.findall(r"\w+", """
-    Act Add Analyse Apply Ask Average Call Change Check Clone Close Collect Combine Compile Compute Configure
-    Connect Continue Create Decide Decode Define Describe Do Draw Drop Encode End Evaluate Exchange Film Find
+    Act Add Analyse Apply Ask Average Call Change Check Clone Close Collect Combine Compare Compile Compute Configure
+    Connect Continue Count Create Decide Decode Define Describe Do Draw Drop Encode End Evaluate Exchange Film Find
     Finish Format Give Hold Identify Infer Join Keep Label Learn List Load Lock Log Look Make Map Measure Move
     Name Normalise Open Parse Place Play Predict Print Put Raise Read Receive Refuse Register Regress Remove
-    Replace Report Return Reward Rotate Run Save Schedule Send Set Show Simulate Stack Start Step Take Train Turn
+    Replace Report Return Reward Rotate Run Save Schedule Send Set Show Simulate Stack Start Step Store Take Train Turn
     Update Verify Wait Walk Weight Write Yield
 """))  # fmt: skip
 FUNCTION_LINES_MEDIAN, FUNCTION_LINES_P95 = 6, 24

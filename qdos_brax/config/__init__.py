@@ -27,7 +27,7 @@ from qdos_brax.config.load import (
     replace,
     to_yaml,
 )
-from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig
+from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig, TuningConfig
 from qdos_brax.config.rules import nearest
 from qdos_brax.config.run_groups import RunConfig, ScanConfig
 from qdos_brax.config.scan import asks_auto, hyper_tree, is_auto, members, population_hyper, values_by_key
@@ -49,6 +49,7 @@ __all__ = [
     "RunConfig",
     "ScanConfig",
     "SkillsConfig",
+    "TuningConfig",
     "ValuesConfig",
     "asks_auto",
     "check_method",

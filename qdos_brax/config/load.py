@@ -138,6 +138,8 @@ def check_method(config: Config) -> None:
             f"high_level.initial={high.initial} learns from the data's rewards: labels.offline_reward must be data, "
             f"not {config.labels.offline_reward}"
         )
+    if config.tuning.skills != "off" and method.low_level != "trajectory":
+        raise UserError(f"{config.method} has no trajectory skills to fine-tune: tuning.skills must stay off")
     if high.utd % high.actor_updates:
         raise UserError(
             f"high_level.utd ({high.utd}) must be a multiple of high_level.actor_updates ({high.actor_updates}): the "
@@ -159,7 +161,7 @@ _AS_BEFORE = {
     ("labels", "latent"): "sample",
     ("labels", "inputs"): "normalised",
 }
-_GROUPS_AS_BEFORE = ("scan", "flow")  # left out if they have their defaults
+_GROUPS_AS_BEFORE = ("scan", "flow", "tuning")  # left out if they have their defaults
 
 
 def config_hash(config: Config) -> str:

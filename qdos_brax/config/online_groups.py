@@ -99,6 +99,34 @@ class HighLevelConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class TuningConfig:
+    """Configure how skills are fine-tuned online, by a critic of single actions within a skill."""
+
+    skills: str = choice(
+        "off",
+        "off (skills stay frozen) or guarded (the low-level policy learns a bounded correction of its actions, which "
+        "is played and handed on only while its episodes earn no less than those of the frozen skills)",
+        "off",
+        "guarded",
+    )
+    bound: Scannable = number(0.2, "largest correction of an action's component (actions lie in [-1, 1])", above=True)
+    noise: Scannable = number(0.1, "standard deviation of the noise on actions in training, frozen skills' included")
+    start_env_steps: int = count(5_000, "environment steps before the correction learns and is tried", low=0)
+    trial_share: float = number(
+        0.25, "share of the training episodes that play whichever of the two has earned less", high=0.5, scan=False
+    )
+    window: int = count(40, "recent episodes, about, over which the two are compared", low=4)
+    heads: int = count(4, "critics; a correction must be an improvement for each of them")
+    batch_size: int = count(32, "macro steps per gradient step, each with all of its environment steps")
+    updates: int = count(4, "critic steps per macro step of experience; the correction makes one")
+    learning_rate: Scannable = rate(3e-4, "Adam learning rate of critics and correction")
+    trace: Scannable = number(
+        0.9, "lambda of the returns within a macro step, whose end the high level values", high=1.0
+    )
+    replay_capacity: int = count(5_000, "most recent macro steps that are learned from")
+
+
+@dataclasses.dataclass(frozen=True)
 class EvalConfig:
     """Configure the evaluation, which has environments of its own."""
 

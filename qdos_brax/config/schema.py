@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from qdos_brax.config.baseline_groups import DiveOffConfig, FlowConfig, GuideConfig, HilbertConfig, PolicyConfig
-from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig
+from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig, TuningConfig
 from qdos_brax.config.rules import Rule, choice, count, field
 from qdos_brax.config.run_groups import RunConfig, ScanConfig
 from qdos_brax.config.skill_groups import DataConfig, SkillsConfig, ValuesConfig
@@ -45,6 +45,7 @@ class Config:
     skills: SkillsConfig = SkillsConfig()
     labels: LabelsConfig = LabelsConfig()
     high_level: HighLevelConfig = HighLevelConfig()
+    tuning: TuningConfig = TuningConfig()
     policy: PolicyConfig = PolicyConfig()
     guide: GuideConfig = GuideConfig()
     hilbert: HilbertConfig = HilbertConfig()

@@ -17,6 +17,7 @@ from qdos_brax.high_level import replay as replay_buffer
 from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
+from qdos_brax.high_level.skill_learning import Played, SkillLearning
 from qdos_brax.high_level.warm_up import WarmUp
 
 NEVER = -1
@@ -33,6 +34,7 @@ class ActingState(struct.PyTreeNode):
         first_goal_step: int32, ``env_steps`` when the goal was first reached, in training or evaluation; ``NEVER``.
         broken: int32, simulations that broke and were reset.
         guided: int32[num_envs], steps that the guide still takes in each episode; None without a guide.
+        seen: what skills that learn have seen.
     """
 
     replay: replay_buffer.Replay
@@ -41,6 +43,7 @@ class ActingState(struct.PyTreeNode):
     first_goal_step: jax.Array
     broken: jax.Array
     guided: Any
+    seen: Any
 
 
 class Acting:
@@ -53,6 +56,7 @@ class Acting:
         capacity: macro transitions that the replay holds.
         warm_up: who acts in the first steps.
         guide: acts for an episode's first steps, or None; it acts step by step, so the horizon must be 1.
+        skill_learning: how the skills are played, and what is kept of that.
 
     Raises:
         ValueError: there is a guide and the horizon is not 1.
@@ -66,12 +70,13 @@ class Acting:
         capacity: int,
         warm_up: WarmUp,
         guide: JumpStart | None,
+        skill_learning: SkillLearning,
     ) -> None:
         if guide is not None and config.skills.horizon != 1:
             raise ValueError("a guide acts step by step: the horizon must be 1")
         self._num_envs, self._horizon = config.high_level.num_envs, config.skills.horizon
         self._warm_up, self._capacity = warm_up, capacity
-        self._env, self._normalise, self._guide = env, normaliser, guide
+        self._env, self._normalise, self._guide, self._skill_learning = env, normaliser, guide, skill_learning
 
     def start(self, key: jax.Array, example: Transition) -> ActingState:
         """Return environments at their starts and an empty replay of rows like ``example``."""
@@ -83,6 +88,7 @@ class Acting:
             first_goal_step=jnp.full((), NEVER, jnp.int32),
             broken=jnp.zeros((), jnp.int32),
             guided=None if guide is None else guide.draw(_guide_key(key), self._num_envs),
+            seen=self._skill_learning.start(),
         )
 
     def step(
@@ -106,33 +112,31 @@ class Acting:
         skill = agent.skill(action, observation)
         discount = hyper["high_level.discount"]
 
-        def one(env_state: State, skill: jax.Array) -> tuple[State, MacroStep]:
-            play = lambda obs, step: agent.play(obs, skill, step)  # noqa: E731
-            return macro_step(self._env, play, env_state, self._horizon, discount)
+        def one(env_state: State, skill: jax.Array, conduct: Any) -> tuple[State, MacroStep]:
+            player = self._skill_learning.player(agent, conduct)
+            play = lambda obs, step: player(obs, skill, step)  # noqa: E731
+            return macro_step(self._env, play, env_state, self._horizon, discount, self._skill_learning.record)
 
-        env_state, result = jax.vmap(one)(state.env_state, skill)
+        conduct = self._skill_learning.conduct(state.seen, key, hyper)
+        env_state, result = jax.vmap(one)(state.env_state, skill, conduct)
         rows = Transition(observation, action, result.reward, result.mask, self._normalise(result.next_observation))
         over = (env_state.done > 0.5) | ~result.finite
-        state = self._after(state, env_state, result, rows, over, reset_key)
+        state = self._after(state, env_state, Played(skill, rows, result, over, state.env_steps), reset_key)
         return state, rows, {"reached": jnp.sum(result.success), "ended": jnp.sum(over)}
 
-    def _after(
-        self,
-        state: ActingState,
-        env_state: State,
-        result: MacroStep,
-        rows: Transition,
-        over: jax.Array,
-        key: jax.Array,
-    ) -> ActingState:
+    def _after(self, state: ActingState, env_state: State, played: Played, key: jax.Array) -> ActingState:
         """Return the state with the rows stored, the steps counted, and ended episodes started anew."""
+        result, over = played.result, played.over
         env_steps = state.env_steps + jnp.sum(result.steps)
         if self._guide is not None:
             fresh = self._guide.draw(_guide_key(key), self._num_envs)
             state = state.replace(guided=jnp.where(over, fresh, jnp.maximum(state.guided - 1, 0)))
         keys = jax.random.split(key, self._num_envs)
         state = state.replace(
-            replay=replay_buffer.insert(state.replay, rows, result.finite),
+            replay=replay_buffer.insert(
+                state.replay, played.rows, result.finite & self._skill_learning.shown(state.seen)
+            ),
+            seen=self._skill_learning.observe(state.seen, key, played),
             env_state=jax.vmap(partial(reset_done, self._env))(env_state, ~result.finite, keys),
             env_steps=env_steps,
             broken=state.broken + jnp.sum(~result.finite).astype(jnp.int32),

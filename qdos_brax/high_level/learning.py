@@ -14,17 +14,19 @@ from qdos_brax.data.device import DeviceData
 from qdos_brax.data.transitions import Transition, macro_transitions
 from qdos_brax.high_level import replay as replay_buffer
 from qdos_brax.high_level.actor_critic import ActorCritic, Reference
+from qdos_brax.high_level.skill_learning import Lesson, SkillLearning
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
 from qdos_brax.skills.low_level import LowLevelPolicy
 
 
 class Learners(struct.PyTreeNode):
-    """Hold everything that learns online: the high level, the bonus for novelty, and the labeller of rewards."""
+    """Hold everything that learns online: the high level, the bonus for novelty, the labeller, and skills that do."""
 
     high_level: Any
     bonus: Any
     labeller: Any
+    skills: Any
 
 
 class Sources(NamedTuple):
@@ -36,6 +38,7 @@ class Sources(NamedTuple):
         skills: parameters of the low-level policy.
         labels: float32[S, width], the high level's action of every offline segment; {} without offline rows.
         hyper: numbers by dotted key.
+        seen: what skills that learn have seen.
     """
 
     replay: replay_buffer.Replay
@@ -43,6 +46,7 @@ class Sources(NamedTuple):
     skills: Any
     labels: Any
     hyper: dict[str, jax.Array]
+    seen: Any = ()
 
 
 class Learning:
@@ -54,9 +58,10 @@ class Learning:
     Args:
         config: the run's configuration.
         high_level: what decides.
-        low_level: the frozen low-level policy.
+        low_level: the low-level policy.
         labeller: gives offline rows their reward and mask.
         bonus: for novelty.
+        skill_learning: what becomes of the skills.
     """
 
     def __init__(
@@ -66,7 +71,9 @@ class Learning:
         low_level: LowLevelPolicy,
         labeller: OfflineReward,
         bonus: Bonus,
+        skill_learning: SkillLearning,
     ) -> None:
+        self._skill_learning = skill_learning
         self._config, self._labels, self._horizon = config.high_level, config.labels, config.skills.horizon
         self._high_level, self._low_level, self._labeller, self._bonus = high_level, low_level, labeller, bonus
         self._offline = round(self._config.batch_size * self._config.offline_fraction)
@@ -77,12 +84,13 @@ class Learning:
             high_level=self._high_level.start(high_level_key, hyper),
             bonus=self._bonus.init(bonus_key),
             labeller=self._labeller.init(labeller_key),
+            skills=self._skill_learning.init(jax.random.fold_in(high_level_key, 1), hyper),
         )
 
     def step(
         self, learners: Learners, given: tuple[jax.Array, Transition], env_steps: jax.Array, sources: Sources
     ) -> tuple[Learners, dict[str, jax.Array]]:
-        """Learn from one macro step: the labels' steps, ``utd`` of the critics, those of actor and temperature.
+        """Learn from one macro step: labels, ``utd`` steps of the critics, those of actor and temperature, skills.
 
         Args:
             learners: before.
@@ -101,7 +109,11 @@ class Learning:
         learners = self._learn_rewards(learners, label_key, active, sources)
         high_level, info = self._learn_high_level(learners, critic_key, actor_key, sources)
         earned = self._bonus.of(learners.bonus, newest.observation, newest.action, hyper)
-        return learners.replace(high_level=high_level), info | {"bonus": jnp.mean(earned)}
+        reference = self._reference(sources.skills, hyper)
+        lesson = Lesson(sources.skills, sources.seen, high_level, reference, env_steps, hyper)
+        skills, skill_info = self._skill_learning.learn(learners.skills, jax.random.fold_in(key, 1), lesson)
+        learners = learners.replace(high_level=high_level, skills=skills)
+        return learners, info | {"bonus": jnp.mean(earned)} | skill_info
 
     def sample(self, learners: Learners, key: jax.Array, sources: Sources) -> Transition:
         """Return a batch, offline rows first, with the bonus for novelty added to rewards."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ class MacroStep(NamedTuple):
         episode_return: undiscounted sum of rewards over the live steps.
         success: 1 if the goal was reached.
         finite: False if the simulation broke; such a step must not be learned from.
+        track: what was recorded of each of the H environment steps, leaves [H, ...].
     """
 
     reward: jax.Array
@@ -30,6 +31,27 @@ class MacroStep(NamedTuple):
     episode_return: jax.Array
     success: jax.Array
     finite: jax.Array
+    track: Any = None
+
+
+class InnerStep(NamedTuple):
+    """Hold one environment step within a macro step.
+
+    Attributes:
+        observation: [obs], before the step.
+        action: [act].
+        reward: of the step.
+        live: 1 if the episode was still going on, otherwise 0.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    live: jax.Array
+
+
+def no_record(step: InnerStep) -> None:
+    """Keep nothing."""
 
 
 def macro_step(
@@ -38,18 +60,22 @@ def macro_step(
     state: State,
     horizon: int,
     discount: jax.Array | float,
+    record: Callable[[InnerStep], Any] = no_record,
 ) -> tuple[State, MacroStep]:
     """Play ``policy`` for ``horizon`` steps of one environment, batched by ``jax.vmap``; it is a function of the
     observation and of the number of steps before.
 
     An episode that ends early idles to the end of the macro step: its state stays, and only live steps count. The
     environment is not reset. A state that is done already gives a macro step of no live steps and reward 0.
+
+    ``record`` says what is kept of each environment step, idle ones included, as the result's ``track``.
     """
 
-    def step(carry: tuple[State, MacroStep], index: jax.Array) -> tuple[tuple[State, MacroStep], None]:
+    def step(carry: tuple[State, MacroStep], index: jax.Array) -> tuple[tuple[State, MacroStep], Any]:
         state, result = carry
         alive = state.done < 0.5
-        new = env.step(state, policy(state.obs, index))
+        action = policy(state.obs, index)
+        new = env.step(state, action)
         finite = jnp.all(jnp.isfinite(new.obs)) & jnp.isfinite(new.reward)
         terminated = (new.done > 0.5) & (new.info["truncation"] < 0.5)
         live = alive.astype(jnp.float32)
@@ -62,12 +88,13 @@ def macro_step(
             success=jnp.maximum(result.success, live * new.metrics["success"]),
             finite=result.finite & (finite | ~alive),
         )
-        return (jax.tree.map(lambda a, b: jnp.where(alive, a, b), new, state), result), None
+        recorded = record(InnerStep(state.obs, action, new.reward, live))
+        return (jax.tree.map(lambda a, b: jnp.where(alive, a, b), new, state), result), recorded
 
     zero = jnp.zeros(())
     start = MacroStep(zero, jnp.ones(()), state.obs, jnp.zeros((), jnp.int32), zero, zero, jnp.ones((), bool))
-    (state, result), _ = jax.lax.scan(step, (state, start), jnp.arange(horizon))
-    return state, result
+    (state, result), track = jax.lax.scan(step, (state, start), jnp.arange(horizon))
+    return state, result._replace(track=track)
 
 
 def reset_done(env: Env, state: State, broken: jax.Array, key: jax.Array) -> State:

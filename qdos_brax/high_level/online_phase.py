@@ -22,6 +22,7 @@ from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.learning import Learners, Learning, Sources
+from qdos_brax.high_level.skill_learning import FrozenSkills, SkillLearning
 from qdos_brax.high_level.warm_up import WarmUp
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
@@ -62,12 +63,13 @@ class OnlinePhase(MemberPhase):
         config: the run's configuration.
         env: the task; the training environments and those of the evaluation are separate states of it.
         normaliser: of observations.
-        low_level: the frozen skills.
+        low_level: the skills.
         high_level: what decides; it begins as an earlier phase left it under "agent", if one did.
         warm_up: who acts in the first steps, and when learning begins.
         labeller: gives offline rows their reward and mask.
         bonus: for novelty.
         guide: acts for an episode's first steps, or None; it acts step by step, so the horizon must be 1.
+        skill_learning: what becomes of the skills; None leaves them frozen.
         steps_per_chunk: environment steps between two returns to the host.
     """
 
@@ -82,6 +84,7 @@ class OnlinePhase(MemberPhase):
         labeller: OfflineReward,
         bonus: Bonus,
         guide: JumpStart | None = None,
+        skill_learning: SkillLearning | None = None,
         steps_per_chunk: int = 2_000,
     ) -> None:
         high, self._horizon = config.high_level, config.skills.horizon
@@ -94,8 +97,9 @@ class OnlinePhase(MemberPhase):
         self._env, self._normalise, self._low_level = env, normaliser, low_level
         self._high_level, self._warm_up = high_level, warm_up
         capacity = min(high.replay_capacity, self.num_chunks * self._iterations * high.num_envs)
-        self._acting = Acting(config, env, normaliser, capacity, warm_up, guide)
-        self.learning = Learning(config, high_level, low_level, labeller, bonus)
+        self._skill_learning = skill_learning or FrozenSkills()
+        self._acting = Acting(config, env, normaliser, capacity, warm_up, guide, self._skill_learning)
+        self.learning = Learning(config, high_level, low_level, labeller, bonus, self._skill_learning)
 
     def bind(self, population: Population, data: DeviceData) -> None:
         """Compile the programs, that of the evaluation included."""
@@ -138,8 +142,11 @@ class OnlinePhase(MemberPhase):
         return {name: artifacts.get(name, {}) for name in ("skills", "labels", "guide")}
 
     def finish(self, state: OnlinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Return the artifacts with the actor and its normaliser; what served learning alone is dropped."""
+        """Return the artifacts with the actor, its normaliser and the skills; what served learning alone is dropped."""
         kept = {name: value for name, value in artifacts.items() if name not in ("labels", "guide", AGENT)}
+        if "skills" in kept:
+            learned, seen = state.learners.skills, state.acting.seen
+            kept["skills"] = jax.vmap(self._skill_learning.final_skills)(learned, seen, kept["skills"])
         normaliser = self._normalise.repeated(state.update.shape[0])
         actor = self._high_level.actor_params(state.learners.high_level)
         return kept | {"actor": actor, "normaliser": normaliser, health.KEY: state.healthy}
@@ -172,9 +179,10 @@ class OnlinePhase(MemberPhase):
         self, state: OnlinePhaseState, _: None, constants: Any, hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[OnlinePhaseState, dict[str, jax.Array]]:
         act_key, update_key, key = jax.random.split(state.key, 3)
-        agent = self._agent(state.learners, constants["skills"], hyper)
+        skills = self._skill_learning.training_skills(state.learners.skills, constants["skills"])
+        agent = self._agent(state.learners, skills, hyper)
         acting, newest, info = self._acting.step(state.acting, act_key, agent, constants["guide"], hyper)
-        sources = Sources(acting.replay, data, constants["skills"], constants["labels"], hyper)
+        sources = Sources(acting.replay, data, constants["skills"], constants["labels"], hyper, acting.seen)
         learn = partial(self.learning.step, env_steps=acting.env_steps, sources=sources)
         keys = jax.random.split(update_key, self._num_envs)
         learners, losses = jax.lax.scan(learn, state.learners, (keys, newest))
@@ -190,7 +198,8 @@ class OnlinePhase(MemberPhase):
         self, state: OnlinePhaseState, constants: Any, hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[OnlinePhaseState, Episodes]:
         key, episode_key = jax.random.split(state.key)
-        agent = self._agent(state.learners, constants["skills"], hyper)
+        skills = self._skill_learning.final_skills(state.learners.skills, state.acting.seen, constants["skills"])
+        agent = self._agent(state.learners, skills, hyper)
         episodes = evaluate(self._env, agent.choose, agent.play, episode_key, self._episodes, self._horizon)
         return state.replace(key=key, acting=with_first_goal(state.acting, episodes.success)), episodes
 

@@ -17,10 +17,12 @@ from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.requirements import refuse, unmet
-from qdos_brax.high_level.actor_critic import AGENT
+from qdos_brax.high_level.actor_critic import AGENT, ActorCritic
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.high_level.sac import SAC
+from qdos_brax.high_level.skill_learning import FrozenSkills, SkillLearning
+from qdos_brax.high_level.tuned_skills import TunedSkills
 from qdos_brax.high_level.warm_up import OfflineWarmUp, RandomWarmUp, WarmUp
 from qdos_brax.labels.bonus import Bonus, NoBonus, RNDBonus
 from qdos_brax.labels.label_phase import LabelPhase
@@ -42,7 +44,7 @@ from qdos_brax.offline.warm_start import WarmStart
 from qdos_brax.population import memory
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
-from qdos_brax.skills.low_level import LowLevelPolicy
+from qdos_brax.skills.low_level import LowLevelPolicy, TrajectorySkills
 from qdos_brax.skills.values import IQL
 
 
@@ -76,7 +78,7 @@ def _given_skills(config: Config, env: Any) -> GivenSkills | None:
 def build_phases(context: BuildContext) -> list[MemberPhase]:
     """Return the phases of ``context.method`` in order, to be bound to a population."""
     config, method, env = context.config, context.method, context.env
-    low_level = make_low_level(config, env)
+    low_level, high_level = make_low_level(config, env), make_actor_critic(config, env)
     if method.policy is not None:
         return [_policy_phase(context, method.policy)]
     high = config.high_level
@@ -93,13 +95,24 @@ def build_phases(context: BuildContext) -> list[MemberPhase]:
             env,
             context.normaliser,
             low_level,
-            make_actor_critic(config, env),
+            high_level,
             _warm_up(config, method),
             _labeller(context, low_level),
             _bonus(context, low_level),
             None if guide is None else guide.jump_start,
+            _skill_learning(config, env, low_level, high_level),
         ),
     ]
+
+
+def _skill_learning(
+    config: Config, env: SpaceSizes, low_level: LowLevelPolicy, high_level: ActorCritic
+) -> SkillLearning:
+    """Return what becomes of the skills online; only those that can be tuned get here with ``tuning.skills`` on."""
+    if config.tuning.skills == "off":
+        return FrozenSkills()
+    assert isinstance(low_level, TrajectorySkills) and isinstance(high_level, SAC)
+    return TunedSkills(config, low_level, high_level, env.observation_size, env.action_size)
 
 
 def _label_phase(context: BuildContext, low_level: LowLevelPolicy) -> LabelPhase:

@@ -65,6 +65,30 @@ class LowLevelPolicy(Protocol):
         ...
 
 
+class TunableSkills(LowLevelPolicy, Protocol):
+    """Define skills whose actions can be corrected: parameters that hold a "correction" play with it.
+
+    Attributes:
+        skill_size: numbers of a skill, as ``begin`` returns it.
+        context_size: numbers that ``context`` returns.
+    """
+
+    skill_size: int
+    context_size: int
+
+    def context(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
+        """Return what the decoder is shown, [..., context_size]."""
+        ...
+
+    def init_correction(self, key: jax.Array, bound: jax.Array | float) -> dict[str, Any]:
+        """Return a correction that is zero everywhere: {"network": parameters, "bound": its largest component}."""
+        ...
+
+    def correction(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
+        """Return what is added to the decoder's action, [..., act]."""
+        ...
+
+
 class LatentModel(Protocol):
     """Define a latent-variable model of behaviour: its prior and its decoder."""
 
@@ -138,6 +162,7 @@ class TrajectorySkills(LatentSkills):
     def __init__(self, model: SkillModel, map_name: str) -> None:
         super().__init__(model, map_name)
         self._skills = model
+        self.skill_size, self.context_size = model.skill_size, model.context_size
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
         """Return the encoder's posterior."""
@@ -146,6 +171,18 @@ class TrajectorySkills(LatentSkills):
     def begin(self, params: Any, latent: jax.Array, observation: jax.Array) -> jax.Array:
         """Return z and the pose in which it begins."""
         return self._skills.begin(params, latent, observation)
+
+    def context(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
+        """Return the view of the observation, and z."""
+        return self._skills.context(params, observation, skill)
+
+    def init_correction(self, key: jax.Array, bound: jax.Array | float) -> dict[str, Any]:
+        """Return a network like the decoder whose last layer is zero."""
+        return self._skills.init_correction(key, bound)
+
+    def correction(self, params: Any, observation: jax.Array, skill: jax.Array) -> jax.Array:
+        """Return the bound times tanh of the network."""
+        return self._skills.correction(params, observation, skill)
 
 
 class TransitionSkills(LatentSkills):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from qdos_brax.config import SkillsConfig
-from qdos_brax.nn.networks import DiagonalGaussian, SegmentEncoder, gaussian_kl, gaussian_log_prob, gaussian_sample
+from qdos_brax.nn.networks import MLP, DiagonalGaussian, SegmentEncoder, gaussian_kl, gaussian_log_prob, gaussian_sample
 from qdos_brax.skills.views import View, WorldView
 
 Params = Any
@@ -44,14 +44,19 @@ class SkillModel:
         action_dim: width of actions.
         seen_dim: width of what the view shows of an observation.
         view: as given.
+        skill_size: width of a skill that has begun: z and a pose.
+        context_size: width of what the decoder is shown.
     """
 
     def __init__(self, observation_dim: int, action_dim: int, config: SkillsConfig, view: View | None = None) -> None:
         self.latent_dim, self.view = config.latent_dim, view or WorldView()
         self.seen_dim, self.action_dim = self.view.size(observation_dim), action_dim
+        self.skill_size = config.latent_dim + self.view.pose_size
+        self.context_size = self.seen_dim + config.latent_dim
         self._encoder = SegmentEncoder(config.encoder_hidden, config.encoder_layers, config.latent_dim)
         self._prior = DiagonalGaussian(config.prior_hidden, config.latent_dim)
         self._decoder = DiagonalGaussian(config.decoder_hidden, action_dim)
+        self._correction = MLP((*config.decoder_hidden, action_dim))
 
     def init(self, key: jax.Array, view: Mapping[str, Params] = MappingProxyType({})) -> dict[str, Params]:
         """Return fresh parameters: {"encoder", "prior", "decoder"}, and "view", what the view knows of the data."""
@@ -60,7 +65,7 @@ class SkillModel:
         return {
             "encoder": self._encoder.init(encoder_key, seen, action),
             "prior": self._prior.init(prior_key, seen[:, 0]),
-            "decoder": self._decoder.init(decoder_key, jnp.zeros((1, self.seen_dim + self.latent_dim))),
+            "decoder": self._decoder.init(decoder_key, jnp.zeros((1, self.context_size))),
             "view": dict(view),
         }
 
@@ -81,8 +86,12 @@ class SkillModel:
         self, params: dict[str, Params], observation: jax.Array, skill: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Return pi(a | s, z): (mean[..., act], log standard deviation[..., act]) of a skill that has begun."""
+        return self._decoder.apply(params["decoder"], self.context(params, observation, skill))
+
+    def context(self, params: dict[str, Params], observation: jax.Array, skill: jax.Array) -> jax.Array:
+        """Return what the decoder is shown, [..., seen + z]: the view of an observation, and the latent."""
         latent, pose = skill[..., : self.latent_dim], skill[..., self.latent_dim :]
-        return self.decode_seen(params, self._see(params, observation, pose), latent)
+        return jnp.concatenate([self._see(params, observation, pose), latent], axis=-1)
 
     def decode_seen(self, params: dict[str, Params], seen: jax.Array, latent: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return pi(a | s, z) of what the view shows of s, ``seen[..., seen]``, and z[..., latent]."""
@@ -93,8 +102,26 @@ class SkillModel:
         return self._see(params, observations, self._pose(params, observations[:, 0])[:, None])
 
     def act(self, params: dict[str, Params], observation: jax.Array, skill: jax.Array) -> jax.Array:
-        """Return the low-level policy's mean action[..., act], clipped to [-1, 1]."""
-        return jnp.clip(self.decode(params, observation, skill)[0], -1.0, 1.0)
+        """Return the low-level policy's mean action[..., act], clipped to [-1, 1].
+
+        Parameters that were fine-tuned online hold a "correction", which is added and the sum clipped again.
+        """
+        action = jnp.clip(self.decode(params, observation, skill)[0], -1.0, 1.0)
+        if "correction" not in params:
+            return action
+        return jnp.clip(action + self.correction(params, observation, skill), -1.0, 1.0)
+
+    def init_correction(self, key: jax.Array, bound: jax.Array | float) -> dict[str, Params]:
+        """Return a correction of the decoder's actions that is zero everywhere: {"network", "bound"}."""
+        network = self._correction.init(key, jnp.zeros((1, self.context_size)))
+        last = f"Dense_{len(self._correction.features) - 1}"
+        blank = jax.tree.map(jnp.zeros_like, network["params"][last])
+        return {"network": {"params": {**network["params"], last: blank}}, "bound": jnp.asarray(bound, jnp.float32)}
+
+    def correction(self, params: dict[str, Params], observation: jax.Array, skill: jax.Array) -> jax.Array:
+        """Return what is added to the decoder's action, [..., act], each component at most the bound."""
+        correction, context = params["correction"], self.context(params, observation, skill)
+        return correction["bound"] * jnp.tanh(self._correction.apply(correction["network"], context))
 
     def decode_along(
         self, params: dict[str, Params], observations: jax.Array, latent: jax.Array

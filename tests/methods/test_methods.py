@@ -25,6 +25,7 @@ from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.learning import Sources
 from qdos_brax.high_level.replay import insert
 from qdos_brax.high_level.sac import SAC
+from qdos_brax.high_level.skill_learning import FrozenSkills
 from qdos_brax.high_level.warm_up import RandomWarmUp
 from qdos_brax.methods.build import build_context, build_phases
 from qdos_brax.nn.networks import gaussian_log_prob
@@ -180,7 +181,7 @@ def test_the_guide_acts_first_and_only_so_long() -> None:
     config = config_of("diffusion-jsrl", **{"high_level.warmup_env_steps": 0})
     guide = JumpStart(lambda params, key, observation: jnp.full((observation.shape[0], 2), 0.123), 0.9, 0.99)
     _, normaliser = to_device(point_dataset(20), 1)
-    acting = Acting(config, PointEnv(), normaliser, 10, RandomWarmUp(0), guide)
+    acting = Acting(config, PointEnv(), normaliser, 10, RandomWarmUp(0), guide, FrozenSkills())
     sac, hyper = SAC(2, 2, config.high_level), first_member(configs.population_hyper(config))
     agent = Agent(normaliser, ActionChunks(2), sac, 1.0, {}, sac.init(jax.random.key(1), 1.0).actor)
     row = Transition(jnp.zeros(2), jnp.zeros(2), jnp.zeros(()), jnp.zeros(()), jnp.zeros(2))
