@@ -138,8 +138,8 @@ def check_method(config: Config) -> None:
             f"high_level.initial={high.initial} learns from the data's rewards: labels.offline_reward must be data, "
             f"not {config.labels.offline_reward}"
         )
-    if config.tuning.skills != "off" and method.low_level != "trajectory":
-        raise UserError(f"{config.method} has no trajectory skills to fine-tune: tuning.skills must stay off")
+    if config.tuning.skills != "frozen" and method.low_level != "trajectory":
+        raise UserError(f"{config.method} has no trajectory skills to fine-tune: tuning.skills must stay frozen")
     if high.utd % high.actor_updates:
         raise UserError(
             f"high_level.utd ({high.utd}) must be a multiple of high_level.actor_updates ({high.actor_updates}): the "

@@ -103,10 +103,10 @@ class TuningConfig:
     """Configure how skills are fine-tuned online, by a critic of single actions within a skill."""
 
     skills: str = choice(
-        "off",
-        "off (skills stay frozen) or guarded (the low-level policy learns a bounded correction of its actions, which "
+        "frozen",
+        "frozen (skills stay as they are) or guarded (the low-level policy learns a bounded correction of its actions, which "
         "is played and handed on only while its episodes earn no less than those of the frozen skills)",
-        "off",
+        "frozen",
         "guarded",
     )
     bound: Scannable = number(0.2, "largest correction of an action's component (actions lie in [-1, 1])", above=True)
@@ -118,7 +118,7 @@ class TuningConfig:
     window: int = count(40, "recent episodes, about, over which the two are compared", low=4)
     heads: int = count(4, "critics; a correction must be an improvement for each of them")
     batch_size: int = count(32, "macro steps per gradient step, each with all of its environment steps")
-    updates: int = count(4, "critic steps per macro step of experience; the correction makes one")
+    utd: int = count(4, "critic steps per macro step of experience; the correction makes one")
     learning_rate: Scannable = rate(3e-4, "Adam learning rate of critics and correction")
     trace: Scannable = number(
         0.9, "lambda of the returns within a macro step, whose end the high level values", high=1.0

@@ -160,13 +160,13 @@ class TunedSkills:
         return Seen(replay, guard)
 
     def learn(self, learned: Tuned, key: jax.Array, lesson: Lesson) -> tuple[Tuned, dict[str, jax.Array]]:
-        """Make ``updates`` steps of the critic, and one of the correction once it is tried."""
+        """Make ``utd`` steps of the critic, and one of the correction once it is tried."""
         critic_key, correction_key = jax.random.split(key)
 
         def critic_step(critic: SkillCriticState, key: jax.Array) -> tuple[SkillCriticState, jax.Array]:
             return self._learn_critic(learned.replace(critic=critic), key, lesson)
 
-        critic, losses = jax.lax.scan(critic_step, learned.critic, jax.random.split(critic_key, self._config.updates))
+        critic, losses = jax.lax.scan(critic_step, learned.critic, jax.random.split(critic_key, self._config.utd))
         learned = learned.replace(critic=critic)
         tracks = replay_buffer.sample(lesson.seen.replay, correction_key, self._config.batch_size)
         corrected, info = self.learn_correction(learned, tracks, lesson.skills, lesson.hyper["tuning.learning_rate"])

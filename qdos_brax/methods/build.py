@@ -109,7 +109,7 @@ def _skill_learning(
     config: Config, env: SpaceSizes, low_level: LowLevelPolicy, high_level: ActorCritic
 ) -> SkillLearning:
     """Return what becomes of the skills online; only those that can be tuned get here with ``tuning.skills`` on."""
-    if config.tuning.skills == "off":
+    if config.tuning.skills == "frozen":
         return FrozenSkills()
     assert isinstance(low_level, TrajectorySkills) and isinstance(high_level, SAC)
     return TunedSkills(config, low_level, high_level, env.observation_size, env.action_size)

@@ -63,8 +63,8 @@ def read_skills(config: Config, env: Any, low_level: LowLevelPolicy) -> GivenSki
             raise UserError(
                 f"{key} is {get(config, key)}, and {get(theirs, key)} in {path}, whose skills are learned; leave it out"
             )
-    if config.tuning.skills != "off" and "correction" in found.arrays["skills"]:
-        raise UserError(f"{path} holds skills that are fine-tuned already; play them with tuning.skills=off")
+    if config.tuning.skills != "frozen" and "correction" in found.arrays["skills"]:
+        raise UserError(f"{path} holds skills that are fine-tuned already; play them with tuning.skills=frozen")
     params, normaliser = jax.tree.map(lambda leaf: leaf[0], (found.arrays["skills"], found.arrays["normaliser"]))
     given = GivenSkills(params, Normaliser(**normaliser))
     try:
