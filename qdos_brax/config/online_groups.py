@@ -105,7 +105,7 @@ class TuningConfig:
     skills: str = choice(
         "frozen",
         "frozen (skills stay as they are) or guarded (the low-level policy learns a bounded correction of its actions, "
-        "which is played and handed on only while its episodes earn no less than those of the frozen skills)",
+        "which is played and handed on only while its episodes earn more than those of the frozen skills)",
         "frozen",
         "guarded",
     )

@@ -16,7 +16,7 @@ from qdos_brax.data.transitions import Transition
 from qdos_brax.high_level import replay as replay_buffer
 from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.jump_start import JumpStart
-from qdos_brax.high_level.macro_step import MacroStep, macro_step, reset_done
+from qdos_brax.high_level.macro_step import InnerStep, MacroStep, macro_step, reset_done
 from qdos_brax.high_level.skill_learning import Played, SkillLearning
 from qdos_brax.high_level.warm_up import WarmUp
 
@@ -115,7 +115,7 @@ class Acting:
         def one(env_state: State, skill: jax.Array, conduct: Any) -> tuple[State, MacroStep]:
             player = self._skill_learning.player(agent, conduct)
             play = lambda obs, step: player(obs, skill, step)  # noqa: E731
-            return macro_step(self._env, play, env_state, self._horizon, discount, self._skill_learning.record)
+            return macro_step(self._env, play, env_state, self._horizon, discount, self._record)
 
         conduct = self._skill_learning.conduct(state.seen, key, hyper)
         env_state, result = jax.vmap(one)(state.env_state, skill, conduct)
@@ -123,6 +123,9 @@ class Acting:
         over = (env_state.done > 0.5) | ~result.finite
         state = self._after(state, env_state, Played(skill, rows, result, over, state.env_steps), reset_key)
         return state, rows, {"reached": jnp.sum(result.success), "ended": jnp.sum(over)}
+
+    def _record(self, step: InnerStep) -> Any:
+        return self._skill_learning.record(step._replace(observation=self._normalise(step.observation)))
 
     def _after(self, state: ActingState, env_state: State, played: Played, key: jax.Array) -> ActingState:
         """Return the state with the rows stored, the steps counted, and ended episodes started anew."""

@@ -31,7 +31,8 @@ class Guard:
 
     Episodes of both kinds are forgotten together, one part in ``window`` per episode that ends, whichever it played:
     both means are over the same stretch of training, so that a high level that gets better favours neither. The tuned
-    decoder is preferred while its mean return is no less than that of the frozen one.
+    decoder is preferred while its mean return is above that of the frozen one: on a sparse task all returns are equal
+    before the first goal, and nothing is proven.
 
     Args:
         window: episodes after which one has lost most of its weight.
@@ -52,7 +53,7 @@ class Guard:
     def prefers_tuned(self, state: GuardState) -> jax.Array:
         """Return whether the tuned decoder is preferred, bool; not before some episodes of each were seen."""
         means = self.means(state)
-        return (jnp.min(state.episodes) >= _LEAST) & (means[TUNED] >= means[FROZEN])
+        return (jnp.min(state.episodes) >= _LEAST) & (means[TUNED] > means[FROZEN])
 
     def observe(
         self, state: GuardState, key: jax.Array, earned: jax.Array, over: jax.Array, valid: jax.Array, tries: jax.Array

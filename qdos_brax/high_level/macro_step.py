@@ -38,7 +38,7 @@ class InnerStep(NamedTuple):
     """Hold one environment step within a macro step.
 
     Attributes:
-        observation: [obs], before the step.
+        observation: [obs], before the step, as the environment gives it.
         action: [act].
         reward: of the step.
         live: 1 if the episode was still going on, otherwise 0.

@@ -71,7 +71,7 @@ class SkillLearning(Protocol):
         ...
 
     def record(self, step: InnerStep) -> Any:
-        """Return what is kept of an environment step."""
+        """Return what is kept of an environment step, whose observation is normalised."""
         ...
 
     def training_skills(self, learned: Any, skills: Any) -> Any:

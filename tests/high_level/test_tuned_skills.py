@@ -17,7 +17,6 @@ from qdos_brax.errors import UserError
 from qdos_brax.high_level import tuned_skills
 from qdos_brax.high_level.agent import Agent
 from qdos_brax.high_level.evaluation import evaluate
-from qdos_brax.high_level.guard import Guard, GuardState
 from qdos_brax.high_level.macro_step import InnerStep, macro_step
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.high_level.sac import SAC
@@ -110,52 +109,6 @@ def test_a_gain_is_what_every_head_agrees_on() -> None:
 def test_the_gradient_passes_through_the_clip() -> None:
     value, slope = jax.value_and_grad(lambda a: through_clip(a) * 3)(1.5)
     assert (float(value), float(slope)) == (3.0, 3.0)
-
-
-# --- The guard -------------------------------------------------------------------------------------------------
-
-
-def guard_after(guard: Guard, episodes: list[tuple[bool, float]]) -> GuardState:
-    """The comparison after single episodes, (of the tuned decoder?, return), one macro step each."""
-    state = guard.start(1)
-    for tuned, earned in episodes:
-        state = state.replace(tuned=jnp.array([tuned]))
-        state = guard.observe(
-            state, jax.random.key(0), jnp.array([earned]), jnp.array([True]), jnp.array([True]), jnp.array(True)
-        )
-    return state
-
-
-def test_the_guard_by_hand() -> None:
-    guard = Guard(window=2, trial_share=0.25)  # an episode counts half after the next one
-    state = guard_after(guard, [(False, -10.0), (True, -4.0), (False, -20.0)])
-    np.testing.assert_allclose(state.episodes, [1.25, 0.5])
-    np.testing.assert_allclose(guard.means(state), [(-20 - 10 / 4) / 1.25, -4.0])
-    assert not guard.prefers_tuned(state)  # too few episodes yet
-    assert np.isnan(guard.means(guard.start(1))).all() and not guard.prefers_tuned(guard.start(1))
-
-
-@pytest.mark.parametrize(("advantage", "preferred"), [(0.1, True), (-0.1, False)])
-def test_the_tuned_decoder_is_preferred_while_it_earns_no_less(advantage: float, preferred: bool) -> None:
-    """Returns rise from episode to episode, as a high level's do: that favours neither."""
-    guard = Guard(window=40, trial_share=0.25)
-    state = guard_after(guard, [(tuned, n + advantage * tuned) for n in range(100) for tuned in (False, True)])
-    np.testing.assert_allclose(np.diff(guard.means(state)), advantage, atol=1e-3)
-    assert bool(guard.prefers_tuned(state)) == preferred
-
-
-def test_episodes_take_turns_as_the_guard_says_and_broken_ones_do_not_count() -> None:
-    guard, many = Guard(window=40, trial_share=0.25), 20_000
-    yes = jnp.ones(many, bool)
-    for total, share in (([-30.0, -20.0], 0.75), ([-20.0, -30.0], 0.25)):
-        state = guard.start(many).replace(episodes=jnp.array([5.0, 5.0]), total=jnp.array(total))
-        after = guard.observe(state, jax.random.key(1), jnp.zeros(many), yes, ~yes, jnp.array(True))
-        np.testing.assert_array_equal(after.episodes, state.episodes)
-        assert abs(float(after.tuned.mean()) - share) < 0.02
-        none = guard.observe(state, jax.random.key(1), jnp.zeros(many), yes, ~yes, jnp.array(False))
-        assert not none.tuned.any()
-    going = guard.observe(guard.start(many), jax.random.key(1), -jnp.ones(many), ~yes, yes, jnp.array(True))
-    assert not going.tuned.any() and float(going.earned[0]) == -1.0
 
 
 # --- Skills on the plane ---------------------------------------------------------------------------------------
@@ -323,6 +276,20 @@ def test_the_high_level_is_not_shown_a_decoder_that_is_not_preferred(slow: Any) 
     for total, shown in (([-50.0, -60.0], [True, False]), ([-60.0, -50.0], [True, True])):
         guard = seen.guard.replace(tuned=jnp.array([False, True]), episodes=jnp.full(2, 5.0), total=jnp.asarray(total))
         np.testing.assert_array_equal(tuned.shown(seen.replace(guard=guard)), shown)
+
+
+def test_the_steps_within_macro_steps_are_seen_as_the_high_level_sees_their_first() -> None:
+    """Normalised: the decoder and both critics know nothing else."""
+    phase, artifacts, keys, _ = plane(FAST, **{"tuning.start_env_steps": 100_000})
+    state, constants = phase.init(keys, artifacts)
+    state, _ = phase.chunk(state, constants)
+    acting = first_member(state.acting)
+    count = int(acting.seen.replay.size)
+    assert count == int(acting.replay.size) > 20
+    rows, tracks = acting.replay.data, acting.seen.replay.data
+    np.testing.assert_array_equal(tracks.observations[:count, 0], rows.observation[:count])
+    raw = phase._normalise.mean + phase._normalise.scale * rows.observation[:count]
+    assert np.abs(raw - rows.observation[:count]).max() > 0.1  # that is not the same
 
 
 def test_only_trajectory_skills_can_be_fine_tuned() -> None:
