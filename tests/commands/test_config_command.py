@@ -50,7 +50,7 @@ def test_a_key_shows_every_layer_that_set_it(capsys: pytest.CaptureFixture[str])
     ("command", "expected"),
     [
         ("skills.alpha --preset paper --env antsoccer", "skills.alpha = 0.3  (set by configs/antsoccer.yaml)"),
-        ("skills.alpha --preset paper", "    accepts number, at least 0; a list makes a scan; flag --alpha"),
+        ("skills.alpha --preset paper", "    accepts number, at least 0, or auto; a list makes a scan; flag --alpha"),
         ("skills.alpha --preset paper --set skills.alpha=0.1,0.2", "skills.alpha = 0.1, 0.2  (set by --set)"),
         ("skills.updates --preset paper", "    accepts whole number, at least 1; flag --pretrain-steps"),
         ("skills.updates --preset smoke", "skills.updates = 50  (set by preset smoke)"),
