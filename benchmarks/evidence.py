@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-import time
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -105,18 +105,9 @@ def train(config: Config, folder: RunFolder, env: Any, dataset: Dataset) -> Any:
 
 def measure(config: Config, env: Any, dataset: Dataset, artifacts: Any, args: Any) -> list[dict[str, Any]]:
     """Return a row per member."""
-    trained, rows = trained_run(config, env, artifacts), []
-    truth = skills.truth_of(trained, dataset)
-    for number, member in enumerate(configs.members(config)):
-        began = time.perf_counter()
-        played = skills.Skills(trained, number, args.draws)
-        found = skills.from_logged_states(played, truth, dataset, args.states)
-        found |= skills.whole_episodes(played, truth, args.episodes) if args.episodes else {}
-        rows.append(arm_of(config, member) | found | {"seconds": time.perf_counter() - began})
-        print(
-            "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()), flush=True
-        )
-    return rows
+    about = [arm_of(config, member) for member in configs.members(config)]
+    trained = trained_run(config, env, artifacts)
+    return skills.measure_members(trained, dataset, about, args.draws, args.states, args.episodes)
 
 
 def run_program(program: Program, asked: Config, env: Any, dataset: Dataset, args: Any) -> list[dict[str, Any]]:
@@ -132,16 +123,8 @@ def run_program(program: Program, asked: Config, env: Any, dataset: Dataset, arg
     with folder.held():
         write_text(folder.config, text)
         rows = measure(config, env, dataset, train(config, folder, env, dataset), args)
-        write_rows(done, rows)
+        skills.write_rows(done, rows)
     return rows
-
-
-def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows as CSV."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def main() -> None:
@@ -164,22 +147,13 @@ def main() -> None:
     env = envs.make(args.env, physics="mujoco")
     flags = {"physics": "mujoco", "seed": args.seed}
     config = configs.load_config(args.env, args.preset, flags, args.settings)
-    data = config.data
-    path = default_dataset(
-        env,
-        transitions=data.transitions,
-        degraded_share=data.degraded_share,
-        noise=data.noise,
-        seed=data.seed,
-        num_envs=data.num_envs,
-    )
-    dataset = formats.read(path, env)
+    dataset = formats.read(default_dataset(env, **dataclasses.asdict(config.data)), env)
     temperature = args.temperature or config.skills.advantage_temperature
     rows: list[dict[str, Any]] = []
     for program in programs(args.view.split(","), temperature, args.alpha or config.skills.alpha, args.outcome_alpha):
         rows += run_program(program, config, env, dataset, args)
     args.out.mkdir(parents=True, exist_ok=True)
-    write_rows(args.out / "evidence.csv", rows)
+    skills.write_rows(args.out / "evidence.csv", rows)
     text = table(rows)
     write_text(args.out / "evidence.txt", text)
     print(text, end="")

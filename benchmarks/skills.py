@@ -23,7 +23,7 @@ from __future__ import annotations
 import argparse
 import csv
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -275,17 +275,35 @@ def measure(run: Path, draws: int, states: int, episodes: int) -> list[dict[str,
     """Return one row per member of a finished run."""
     trained, dataset = read_finished(RunFolder.open(run))
     trained = on_mujoco_c(trained)
+    run_row = {"task": trained.config.env, "method": trained.config.method, "view": trained.config.skills.view}
+    about = [run_row | settings for settings in configs.members(trained.config)]
+    return measure_members(trained, dataset, about, draws, states, episodes)
+
+
+def measure_members(
+    trained: TrainedRun, dataset: Dataset, about: Sequence[dict[str, Any]], draws: int, states: int, episodes: int
+) -> list[dict[str, Any]]:
+    """Return one row per member, which begins with what is known ``about`` it; without ``episodes`` none are played."""
     truth, rows = truth_of(trained, dataset), []
-    for member, settings in enumerate(configs.members(trained.config)):
+    for member, known in enumerate(about):
         started = time.perf_counter()
         skills = Skills(trained, member, draws)
-        found = from_logged_states(skills, truth, dataset, states) | whole_episodes(skills, truth, episodes)
-        row = {"task": trained.config.env, "method": trained.config.method, "view": trained.config.skills.view}
-        rows.append(row | settings | found | {"seconds": time.perf_counter() - started})
+        found = from_logged_states(skills, truth, dataset, states)
+        found |= whole_episodes(skills, truth, episodes) if episodes else {}
+        rows.append(known | found | {"seconds": time.perf_counter() - started})
         print(
             "  ".join(f"{k} {v:.2f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()), flush=True
         )
     return rows
+
+
+def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write rows as CSV; those of mazes and of arms differ in some columns."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def main() -> None:
@@ -299,11 +317,7 @@ def main() -> None:
     args = parser.parse_args()
     prepare_jax()
     rows = [row for run in args.runs for row in measure(run, args.draws, args.states, args.episodes)]
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with args.out.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(args.out, rows)
 
 
 if __name__ == "__main__":

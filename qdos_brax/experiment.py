@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 import time
@@ -286,16 +287,7 @@ def _data_file(config: Config, env: Any) -> tuple[Path, str | None]:
     if config.dataset:
         found = download.resolve(config.dataset)
         return formats.data_file(found.path), found.sha256
-    data = config.data
-    path = default_dataset(
-        env,
-        transitions=data.transitions,
-        degraded_share=data.degraded_share,
-        noise=data.noise,
-        seed=data.seed,
-        num_envs=data.num_envs,
-    )
-    return path, None
+    return default_dataset(env, **dataclasses.asdict(config.data)), None
 
 
 def _announce(config: Config, asked: Config, chosen: bool) -> None:
