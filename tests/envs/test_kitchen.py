@@ -21,6 +21,7 @@ from qdos_brax.collection.scripted.kitchen import KitchenDemonstrator
 from qdos_brax.commands import doctor
 from qdos_brax.high_level.evaluation import evaluate, summary
 from tests.collection.scripted.kitchen_player import play
+from tests.envs.broken_state import assert_reset_alone
 from tests.envs.kitchen_reference import kitchen, reference, rollout
 
 
@@ -191,11 +192,7 @@ def test_an_evaluation_tells_the_share_of_the_four(env: Any, monkeypatch: pytest
 
 
 def test_a_broken_state_is_reset_alone(three: Any) -> None:
-    states = three.reset(jax.random.split(jax.random.key(0), 3))
-    broken = states.pipeline_state.replace(qpos=states.pipeline_state.qpos.at[1, 0].set(jnp.nan))
-    after = three.step(states.replace(pipeline_state=broken), np.ones((3, 9), np.float32))
-    np.testing.assert_array_equal(after.metrics["nan"], [0, 1, 0])
-    assert bool(jnp.isfinite(after.obs).all()) and after.pipeline_state.steps.tolist() == [1, 0, 1]
+    assert_reset_alone(three.reset(jax.random.split(jax.random.key(0), 3)), three.step, 9)
 
 
 def test_gymnasium_makes_one_and_a_batch() -> None:

@@ -17,6 +17,7 @@ import envs
 import envs.gym_api
 from envs import render
 from envs.manipulation import ogbench_model
+from tests.envs.broken_state import assert_reset_alone
 from tests.envs.manipspace_reference import oracle_actions, place, reference, rollout, start_of
 
 BUTTON, DRAWER, WINDOW = 21, 23, 24  # places in qpos of the scene
@@ -200,11 +201,7 @@ def test_actions_beyond_the_range_are_clipped() -> None:
 
 def test_a_broken_state_is_reset_alone() -> None:
     batch = programs("scene-task2")
-    states = batch.many(jax.random.split(jax.random.key(0), 3))
-    broken = states.pipeline_state.replace(qpos=states.pipeline_state.qpos.at[1, 0].set(jnp.nan))
-    after = batch.step_many(states.replace(pipeline_state=broken), np.ones((3, 5), np.float32))
-    np.testing.assert_array_equal(after.metrics["nan"], [0, 1, 0])
-    assert bool(jnp.isfinite(after.obs).all()) and after.pipeline_state.steps.tolist() == [1, 0, 1]
+    assert_reset_alone(batch.many(jax.random.split(jax.random.key(0), 3)), batch.step_many, 5)
 
 
 def test_a_cube_that_was_shot_out_is_put_back_on_the_table() -> None:
