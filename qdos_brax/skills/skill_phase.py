@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -27,6 +27,12 @@ from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
 from qdos_brax.skills.temperature import effective_share, member_temperature
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
+
+SCHEDULES: Mapping[str, Callable[[int], optax.Schedule]] = {
+    "constant": lambda updates: optax.constant_schedule(1.0),
+    "cosine": lambda updates: optax.cosine_decay_schedule(1.0, updates),
+}
+"""The factor on the learning rate, by ``skills.schedule`` and number of gradient steps."""
 
 
 class SkillPhaseState(struct.PyTreeNode):
@@ -87,6 +93,7 @@ class SkillPhase(MemberPhase):
         self._alpha: Alpha = AdaptiveAlpha() if asks_auto(config.skills.alpha) else FixedAlpha()
         self._finds_temperature = asks_auto(config.skills.advantage_temperature)
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
+        self._rate = SCHEDULES[self._skills.schedule](total_blocks * self._skills.mi_every)
         self._blocks = min(blocks_per_chunk, total_blocks)
         super().__init__("skills", "pretrain", -(-total_blocks // self._blocks))
 
@@ -211,7 +218,8 @@ class SkillPhase(MemberPhase):
             return total + self._alpha.weight(state.alpha, hyper) * information_loss, info
 
         grads, info = jax.grad(loss, has_aux=True)(state.params)
-        params, opt_state = adam_step(state.params, state.opt_state, grads, hyper["skills.learning_rate"])
+        rate = hyper["skills.learning_rate"] * self._rate(state.update)
+        params, opt_state = adam_step(state.params, state.opt_state, grads, rate)
         info = info | {"weight_ess": effective_share(weight)}
         if "temperature" in artifacts:
             info = info | {"weight_temperature": artifacts["temperature"]}
