@@ -24,6 +24,7 @@ NEWEST_PYTHON = shutil.which("python3.13")
 NEWEST = {
     "completion",
     "docs",
+    "hub",
     "minari",
     "sweeps",
     "video",

@@ -42,7 +42,9 @@ def main_parser(argv: Sequence[str], prog: str = _PROGRAM) -> Parser:
         commands.add_parser("data", help="make, fetch, describe, check and export data files")
 
     evaluate = commands.add_parser("evaluate", help="evaluate the policy of a run")
-    evaluate.add_argument("runs", metavar="RUN", nargs="+", help="a run folder, or a file that `export` wrote")
+    evaluate.add_argument(
+        "runs", metavar="RUN", nargs="+", help="a run folder, a file that `export` wrote, or hub:USER/NAME"
+    )
     evaluate.add_argument("--episodes", metavar="N", type=positive, default=20, help="episodes per member (default 20)")
     evaluate.add_argument(
         "--video", metavar="FILE", help="also film the first member's first episode, as .mp4; takes one RUN"
@@ -99,16 +101,17 @@ def _evaluate(args: argparse.Namespace) -> int:
 
     from qdos_brax.analysis.conclusion import listed
     from qdos_brax.analysis.finished import evaluate_run
+    from qdos_brax.runs.hub import local_path
     from qdos_brax.runs.jax_setup import prepare_jax
 
     prepare_jax()
     if args.video:
         from qdos_brax.analysis.film import film_run
 
-        episode = film_run(Path(args.runs[0]), Path(args.video))
+        episode = film_run(local_path(args.runs[0]), Path(args.video))
         print(f"{args.video}: " + ", ".join(f"{name} {value:g}" for name, value in episode.items()), flush=True)
     for run in args.runs:
-        for member in evaluate_run(Path(run), args.episodes):
+        for member in evaluate_run(local_path(run), args.episodes):
             print(f"{run}: " + ", ".join(f"{name} {listed(value)}" for name, value in member.items()))
     return 0
 

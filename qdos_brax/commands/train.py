@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from qdos_brax import __version__
@@ -73,7 +71,7 @@ def _add_run(group: Any) -> None:
         metavar="FILE",
         help="OGBench .npz, D4RL .hdf5, Minari folder, or a public set's name (default: the task's own set, collected)",
     )
-    group.add_argument("--skills", metavar="FILE", help="begin on the skills that `export` wrote")
+    group.add_argument("--skills", metavar="FILE", help="begin on the skills that `export` wrote (or hub:USER/NAME)")
     group.add_argument("--physics", metavar="ENGINE", help="auto, mjx, mjx-warp or mujoco (default auto)")
 
 
@@ -158,8 +156,10 @@ def configs_from_args(args: argparse.Namespace) -> dict[str, Config]:
 def _of_skills(file: str) -> dict[str, Any]:
     """Return what a file of skills says of them, by dotted key: what is trained on them must not differ."""
     from qdos_brax.runs.export import skill_settings  # here, so that --help and a wrong flag wait for no jax
+    from qdos_brax.runs.hub import local_path
 
-    return {"skills_file": os.path.abspath(file), **skill_settings(Path(file))}
+    path = local_path(file).absolute()
+    return {"skills_file": str(path), **skill_settings(path)}
 
 
 def _train(args: argparse.Namespace, started: float) -> int:
