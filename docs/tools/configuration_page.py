@@ -6,7 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from qdos_brax.commands.config import accepted, written
-from qdos_brax.config.schema import Config, get_field, groups, leaves
+from qdos_brax.config import load_config
+from qdos_brax.config.layers import families
+from qdos_brax.config.methods import METHODS
+from qdos_brax.config.methods import settings as published_settings
+from qdos_brax.config.rules import convert
+from qdos_brax.config.schema import Config, get, get_field, groups, leaves
 from qdos_brax.files import write_text
 
 PAGE = Path(__file__).resolve().parents[1] / "configuration.md"
@@ -27,9 +32,31 @@ python -m qdos_brax config skills.alpha --env antsoccer --method supe
 ([Scans](scans.md)). A list of any other key makes one program after another."""
 
 
+SHRUNK = """## What preset cpu changes of the published methods
+
+Every method has the values that its authors published ([Methods](methods.md)); preset `paper` keeps them. These are the ones that
+preset `cpu` has made smaller or moved, so that a run takes minutes on two cores; `--set KEY=VALUE` brings one back."""
+
+
 def page() -> str:
     """Return the page."""
-    return "\n\n".join([HEAD, *_sections()]) + "\n"
+    return "\n\n".join([HEAD, *_sections(), SHRUNK, "\n".join(_shrunk())]) + "\n"
+
+
+def _shrunk() -> Iterator[str]:
+    """Yield a table of the published values that preset cpu overrides: one row for families that have the same two."""
+    yield "| method | key | published | preset cpu | task families |"
+    yield "|---|---|---|---|---|"
+    found: dict[tuple[str, ...], list[str]] = {}
+    for method in METHODS:
+        for family in families():
+            config = load_config(family, "cpu", {"method": method})
+            for key, value in published_settings(method, family).items():
+                published, used = convert(key, value, get_field(key)), get(config, key)
+                if published != used:
+                    found.setdefault((method, key, written(published), written(used)), []).append(family)
+    for (method, key, published, used), own in found.items():
+        yield f"| {method} | `{key}` | `{published}` | `{used}` | {', '.join(own)} |"
 
 
 def _sections() -> Iterator[str]:
