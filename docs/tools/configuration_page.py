@@ -34,8 +34,9 @@ python -m qdos_brax config skills.alpha --env antsoccer --method supe
 
 SHRUNK = """## What preset cpu changes of the published methods
 
-Every method has the values that its authors published ([Methods](methods.md)); preset `paper` keeps them. These are the ones that
-preset `cpu` has made smaller or moved, so that a run takes minutes on two cores; `--set KEY=VALUE` brings one back."""
+Every method has the values that its authors published ([Methods](methods.md)); preset `paper` keeps them. These are the
+ones that preset `cpu` has made smaller or moved, so that a run takes minutes on two cores; `--set KEY=VALUE` brings one
+back."""
 
 
 def page() -> str:
