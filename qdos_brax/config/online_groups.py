@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from qdos_brax.config.rules import choice, count, number, rate, widths
+from qdos_brax.config.rules import choice, count, number, rate, schedule, widths
 from qdos_brax.config.skill_groups import Scannable
 
 
@@ -64,6 +64,7 @@ class HighLevelConfig:
         1, "steps of actor and temperature per macro step, evenly among the critics' (SUPE: 4 among 80)"
     )
     learning_rate: Scannable = rate(3e-4, "Adam learning rate of actor, critics and temperature")
+    schedule: str = schedule("the last environment step")
     discount: Scannable = number(0.99, "discount per macro step", high=1.0)
     target_rate: Scannable = number(0.005, "Polyak rate of the target critics", high=1.0, above=True)
     value_scale: float = number(1.0, "Q per unit of a critic's output", above=True, scan=False)

@@ -87,6 +87,13 @@ def rate(default: float, meaning: str = "Adam learning rate") -> Any:
     return number(default, meaning, high=1.0, above=True)
 
 
+def schedule(end: str) -> Any:
+    """Return a field for how a learning rate goes on until ``end``."""
+    return choice(
+        "constant", f"how the learning rate goes on: constant, or cosine (down to 0 at {end})", "constant", "cosine"
+    )
+
+
 def choice(default: str, meaning: str, *choices: str) -> Any:
     """Return a field for one of a few words."""
     return field(default, meaning, Rule("text", choices=choices))

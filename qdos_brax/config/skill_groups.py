@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from qdos_brax.config.rules import choice, count, flag, number, rate, widths
+from qdos_brax.config.rules import choice, count, flag, number, rate, schedule, widths
 
 Scannable = float | tuple[float, ...]
 ScannableOrAuto = float | str | tuple[float | str, ...]
@@ -84,12 +84,7 @@ class SkillsConfig:
     prior_hidden: tuple[int, ...] = widths((256, 256), "hidden layers of the state prior")
     batch_size: int = count(256, "segments per gradient step")
     learning_rate: Scannable = rate(3e-4)
-    schedule: str = choice(
-        "constant",
-        "how the learning rate goes on: constant, or cosine (down to 0 at the last gradient step)",
-        "constant",
-        "cosine",
-    )
+    schedule: str = schedule("the last gradient step")
     kl_weight: Scannable = number(0.1, "beta, the weight of KL(posterior || prior)")
     kl_weighted: bool = flag(
         True, "whether the advantage weight multiplies the KL too (Algorithm 1 of the paper) or not (equation 4)"

@@ -17,6 +17,7 @@ from qdos_brax.high_level.actor_critic import ActorCritic, Reference
 from qdos_brax.high_level.skill_learning import Lesson, SkillLearning
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
+from qdos_brax.nn.optim import rate_schedule
 from qdos_brax.skills.low_level import LowLevelPolicy
 
 
@@ -77,6 +78,7 @@ class Learning:
         self._config, self._labels, self._horizon = config.high_level, config.labels, config.skills.horizon
         self._high_level, self._low_level, self._labeller, self._bonus = high_level, low_level, labeller, bonus
         self._offline = round(self._config.batch_size * self._config.offline_fraction)
+        self._rate = rate_schedule(self._config.schedule, self._config.env_steps)
 
     def init(self, high_level_key: jax.Array, bonus_key: jax.Array, labeller_key: jax.Array, hyper: Any) -> Learners:
         """Return fresh learners."""
@@ -101,7 +103,8 @@ class Learning:
         Returns:
             The learners after, and scalars for metrics.csv.
         """
-        (key, newest), hyper = given, sources.hyper
+        (key, newest), hyper = given, self._decayed(sources.hyper, env_steps)
+        sources = sources._replace(hyper=hyper)
         active = env_steps >= self._labels.start_env_steps
         label_key, actor_key, critic_key = jax.random.split(key, 3)
         bonus = self._bonus.learn(learners.bonus, newest.observation[None], newest.action[None], hyper, active)
@@ -170,6 +173,11 @@ class Learning:
         actor_keys = actor_key[None] if turns == 1 else jax.random.split(actor_key, turns)
         state, info = jax.lax.scan(turn, learners.high_level, (critic_keys, actor_keys))
         return state, jax.tree.map(jnp.mean, info)
+
+    def _decayed(self, hyper: dict[str, jax.Array], env_steps: jax.Array) -> dict[str, jax.Array]:
+        """Return the numbers with the high level's learning rate as it is by now."""
+        key = "high_level.learning_rate"
+        return hyper | {key: hyper[key] * self._rate(env_steps)}
 
     def _reference(self, skills: Any, hyper: dict[str, jax.Array]) -> Reference | None:
         """Return the density that the actor is held against, the skill prior's or none."""

@@ -18,6 +18,11 @@ def adam_step(params: Params, opt_state: optax.OptState, grads: Params, learning
     return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), opt_state
 
 
+def rate_schedule(name: str, steps: int) -> optax.Schedule:
+    """Return the factor on a learning rate by the step: "constant" is 1, "cosine" falls from 1 to 0 at ``steps``."""
+    return optax.constant_schedule(1.0) if name == "constant" else optax.cosine_decay_schedule(1.0, steps)
+
+
 def polyak(target: Params, params: Params, rate: jax.Array | float) -> Params:
     """Return ``target`` moved towards ``params`` by ``rate`` of the way."""
     return jax.tree.map(lambda t, p: t + rate * (p - t), target, params)

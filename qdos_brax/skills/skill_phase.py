@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -16,7 +16,7 @@ from flax import struct
 from qdos_brax.config import Config, SkillsConfig, asks_auto
 from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import window
-from qdos_brax.nn.optim import ADAM, adam_step
+from qdos_brax.nn.optim import ADAM, adam_step, rate_schedule
 from qdos_brax.population import health
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
@@ -27,12 +27,6 @@ from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
 from qdos_brax.skills.temperature import effective_share, member_temperature
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
-
-SCHEDULES: Mapping[str, Callable[[int], optax.Schedule]] = {
-    "constant": lambda updates: optax.constant_schedule(1.0),
-    "cosine": lambda updates: optax.cosine_decay_schedule(1.0, updates),
-}
-"""The factor on the learning rate, by ``skills.schedule`` and number of gradient steps."""
 
 
 class SkillPhaseState(struct.PyTreeNode):
@@ -93,7 +87,7 @@ class SkillPhase(MemberPhase):
         self._alpha: Alpha = AdaptiveAlpha() if asks_auto(config.skills.alpha) else FixedAlpha()
         self._finds_temperature = asks_auto(config.skills.advantage_temperature)
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
-        self._rate = SCHEDULES[self._skills.schedule](total_blocks * self._skills.mi_every)
+        self._rate = rate_schedule(self._skills.schedule, total_blocks * self._skills.mi_every)
         self._blocks = min(blocks_per_chunk, total_blocks)
         super().__init__("skills", "pretrain", -(-total_blocks // self._blocks))
 
