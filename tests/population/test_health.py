@@ -62,7 +62,7 @@ def phases() -> dict[str, Any]:
     phases = {
         "values": ValuePhase(config, IQL(2, 2, (16,)), updates_per_chunk=10),
         "skills": SkillPhase(config, model, LoggedWeights(), information, blocks_per_chunk=1),
-        "policy": OfflinePhase("policy", policy, normaliser, 20, None, 10),
+        "policy": OfflinePhase("policy", policy, normaliser, 20, updates_per_chunk=10),
         "label": LabelPhase(config.skills.horizon, len(data.starts), low_level),
         "online": online,
     }
