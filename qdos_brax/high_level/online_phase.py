@@ -153,12 +153,13 @@ class OnlinePhase(MemberPhase):
 
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> OnlinePhaseState:
         """Return fresh learners, an empty replay, environments at their starts."""
-        high_level_key, bonus_key, labeller_key, env_key, key = jax.random.split(key, 5)
+        high_level_key, bonus_key, labeller_key, env_key, key, skill_key = jax.random.split(key, 6)
+        keys = Learners(high_level_key, bonus_key, labeller_key, skill_key)
         observation = jnp.zeros(self._high_level.observation_dim)
         row = Transition(observation, jnp.zeros(self._high_level.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
         return OnlinePhaseState(
             key=key,
-            learners=self.learning.init(high_level_key, bonus_key, labeller_key, hyper),
+            learners=self.learning.init(keys, hyper),
             acting=self._acting.start(env_key, row),
             update=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),

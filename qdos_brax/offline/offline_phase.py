@@ -97,8 +97,9 @@ class OfflinePhase(MemberPhase):
         chunk = int(metrics["update"][0]) // self._updates
         if self._evaluation is not None and (chunk % self._evaluate_every == 0 or chunk == self.num_chunks):
             started = time.perf_counter()
-            # A key that no update uses, so that evaluating does not change what is learned.
-            keys = jax.vmap(jax.random.fold_in)(state.key, state.update)
+            # A key that no update uses, so that evaluating does not change what is learned: fold_in(key, i) is
+            # split(key, n)[i], and the next chunk uses those up to its number of updates.
+            keys = jax.vmap(jax.random.fold_in)(state.key, jnp.maximum(state.update, self._updates + 1))
             episodes = self._evaluate(self._learner.params(state.learner), keys, self.data)
             metrics |= summary(episodes) | {"eval_seconds": time.perf_counter() - started}
         return state, metrics
