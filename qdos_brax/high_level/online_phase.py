@@ -188,9 +188,10 @@ class OnlinePhase(MemberPhase):
         keys = jax.random.split(update_key, self._num_envs)
         learners, losses = jax.lax.scan(learn, state.learners, (keys, newest))
 
-        learners, healthy = health.keep_finite(state.healthy, learners, state.learners)
-        learns = self._warm_up.learns(acting.env_steps)
+        # Not from an empty replay, whose rows are NaN: the simulation may break in the very first macro step.
+        learns = self._warm_up.learns(acting.env_steps) & (acting.replay.size > 0)
         learners = jax.tree.map(lambda new, old: jnp.where(learns, new, old), learners, state.learners)
+        learners, healthy = health.keep_finite(state.healthy, learners, state.learners)
         update = state.update + jnp.where(learns, self._num_envs * self._utd, 0)
         state = state.replace(key=key, learners=learners, acting=acting, healthy=healthy, update=update)
         return state, info | jax.tree.map(jnp.mean, losses)
