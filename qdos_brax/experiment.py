@@ -35,7 +35,7 @@ from qdos_brax.methods.build import bind_phases, build_context, build_phases, ch
 from qdos_brax.population.members import Population
 from qdos_brax.runs import comparison, observers, shares, signals
 from qdos_brax.runs.checkpoint import Artifacts
-from qdos_brax.runs.fingerprints import sha256
+from qdos_brax.runs.fingerprints import sha256_once
 from qdos_brax.runs.folder import RunFolder, new_path
 from qdos_brax.runs.hints import resume_command, resume_flag
 from qdos_brax.runs.hosts import ALONE, Hosts
@@ -239,7 +239,7 @@ def _load_data(config: Config) -> _Data:
     dataset = formats.read(path, env)
     for line in remarks(dataset, config):
         print(f"note      {line}", flush=True)
-    return _Data(env, path, digest or sha256(path), dataset, time.perf_counter() - before)
+    return _Data(env, path, digest or sha256_once(path), dataset, time.perf_counter() - before)
 
 
 def _train(

@@ -73,13 +73,21 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
     arrays: Arrays = {"members": np.asarray(members), **_place(trained.env), **_truth(trained, sample)}
     latents, runner = _LatentView(trained, sample), EpisodeRunner(trained)
     with ThreadPoolExecutor(1) as beside:  # t-SNE on one core while episodes are played and drawn on another
+        places = {}
         for member in members:
             view, episode = latents.of(member), play_episode(trained, runner, member)
-            places = beside.submit(embedded, view["latent"], episode.latents) if "latent" in view else None
+            if "latent" in view:
+                places[member] = beside.submit(embedded, view["latent"], episode.latents)
             measured = measure_episode(trained.env, episode, trained.config.skills.horizon)
-            found = _weights(trained, member, sample) | view | measured | (places.result() if places else {})
-            arrays |= {f"{member}/{name}": array for name, array in found.items()}
+            arrays |= _of_member(member, _weights(trained, member, sample) | view | measured)
+        for member, embedding in places.items():
+            arrays |= _of_member(member, embedding.result())
     write_arrays(out, arrays)
+
+
+def _of_member(member: int, arrays: Arrays) -> Arrays:
+    """Return a member's arrays by the names that they have in the file."""
+    return {f"{member}/{name}": array for name, array in arrays.items()}
 
 
 class _Sample(NamedTuple):

@@ -27,14 +27,15 @@ def picture_steps(states: int, horizon: int | None) -> np.ndarray:
     Args:
         states: of the episode, its start included.
         horizon: control steps between two decisions, to show the states of the paper's decisions and the end, of
-            evenly spread decisions if the episode has fewer; None for states that are evenly spaced.
+            evenly spread decisions if the episode has fewer; None for states that are evenly spaced. The end is the
+            picture of the last decision, which has no other unless it is the only one.
     """
     if horizon is None:
         return evenly_spaced(_FRAMES, states)
-    decisions = -(-(states - 1) // horizon)
+    before_last = max(1, -(-(states - 1) // horizon) - 1)
     chosen = np.asarray(_DECISIONS)
-    if chosen[-1] >= decisions:
-        chosen = evenly_spaced(len(chosen), decisions)
+    if chosen[-1] >= before_last:
+        chosen = evenly_spaced(len(chosen), before_last)
     return np.append(chosen * horizon, states - 1)
 
 

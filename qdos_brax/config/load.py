@@ -145,8 +145,6 @@ def check_method(config: Config) -> None:
             f"high_level.utd ({high.utd}) must be a multiple of high_level.actor_updates ({high.actor_updates}): the "
             "same number of critic steps lies between any two of the actor's"
         )
-    if method.weighted and config.values.estimator == "iql" and config.values.n_step > horizon:
-        raise UserError(f"values.n_step ({config.values.n_step}) must not exceed skills.horizon ({horizon})")
 
 
 _AS_BEFORE = {

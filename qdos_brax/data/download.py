@@ -24,7 +24,7 @@ from qdos_brax.data import cache, sources
 from qdos_brax.data.sources import PublicDataset
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
-from qdos_brax.runs.fingerprints import sha256
+from qdos_brax.runs.fingerprints import sha256_once
 from qdos_brax.runs.progress import Progress
 
 _PIECE = 1 << 20  # bytes per step of the progress bar, and at most per read
@@ -248,7 +248,7 @@ def _check_record(path: Path) -> str:
 
 
 def _describe(path: Path) -> dict[str, Any]:
-    return {"size": path.stat().st_size, "sha256": sha256(path)}
+    return {"size": path.stat().st_size, "sha256": sha256_once(path)}
 
 
 def _size(path: Path) -> int:

@@ -11,7 +11,7 @@ from qdos_brax.data import download, formats
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.runs import comparison, shares
-from qdos_brax.runs.fingerprints import sha256
+from qdos_brax.runs.fingerprints import sha256_once
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import resume_command
 
@@ -24,7 +24,7 @@ def relocate(path: str, dataset: str) -> None:
     """
     found = download.resolve(dataset)
     file = formats.data_file(found.path)
-    digest = found.sha256 or sha256(file)
+    digest = found.sha256 or sha256_once(file)
     folders = list(comparison.runs(Path(path)).values()) if comparison.is_comparison(path) else [RunFolder.open(path)]
     folders += [share for folder in folders for share in shares.shares_of(folder)]
     for folder in folders:

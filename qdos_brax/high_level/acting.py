@@ -80,14 +80,14 @@ class Acting:
 
     def start(self, key: jax.Array, example: Transition) -> ActingState:
         """Return environments at their starts and an empty replay of rows like ``example``."""
-        guide = self._guide
+        guide, keys = self._guide, jax.random.split(key, self._num_envs + 1)
         return ActingState(
             replay=replay_buffer.create(example, self._capacity),
-            env_state=jax.vmap(self._env.reset)(jax.random.split(key, self._num_envs)),
+            env_state=jax.vmap(self._env.reset)(keys[:-1]),
             env_steps=jnp.zeros((), jnp.int32),
             first_goal_step=jnp.full((), NEVER, jnp.int32),
             broken=jnp.zeros((), jnp.int32),
-            guided=None if guide is None else guide.draw(_guide_key(key), self._num_envs),
+            guided=None if guide is None else guide.draw(keys[-1], self._num_envs),
             seen=self._skill_learning.start(),
         )
 
@@ -100,13 +100,13 @@ class Acting:
             The state after, the rows[num_envs] that were stored, and counts of episodes that reached the goal
             ("reached") and that ended ("ended").
         """
-        first_key, actor_key, reset_key = jax.random.split(key, 3)
+        first_key, actor_key, after_key, guide_key, conduct_key = jax.random.split(key, 5)
         observation = self._normalise(state.env_state.obs)
         first = agent.low_level.first(agent.skills, first_key, observation, agent.box)
         action = agent.high_level.act(agent.actor, actor_key, observation)
         action = self._warm_up.action(state.env_steps, first, action)
         if self._guide is not None:
-            guided = self._guide.sample(guide_params, _guide_key(actor_key), observation)
+            guided = self._guide.sample(guide_params, guide_key, observation)
             guided = agent.low_level.to_action(agent.skills, guided, observation, agent.box)
             action = jnp.where(state.guided[:, None] > 0, guided, action)
         skill = agent.skill(action, observation)
@@ -117,11 +117,11 @@ class Acting:
             play = lambda obs, step: player(obs, skill, step)  # noqa: E731
             return macro_step(self._env, play, env_state, self._horizon, discount, self._record)
 
-        conduct = self._skill_learning.conduct(state.seen, key, hyper)
+        conduct = self._skill_learning.conduct(state.seen, conduct_key, hyper)
         env_state, result = jax.vmap(one)(state.env_state, skill, conduct)
         rows = Transition(observation, action, result.reward, result.mask, self._normalise(result.next_observation))
         over = (env_state.done > 0.5) | ~result.finite
-        state = self._after(state, env_state, Played(skill, rows, result, over, state.env_steps), reset_key)
+        state = self._after(state, env_state, Played(skill, rows, result, over, state.env_steps), after_key)
         return state, rows, {"reached": jnp.sum(result.success), "ended": jnp.sum(over)}
 
     def _record(self, step: InnerStep) -> Any:
@@ -131,16 +131,16 @@ class Acting:
         """Return the state with the rows stored, the steps counted, and ended episodes started anew."""
         result, over = played.result, played.over
         env_steps = state.env_steps + jnp.sum(result.steps)
+        keys = jax.random.split(key, self._num_envs + 2)  # the environments', the guide's, that of what is seen
         if self._guide is not None:
-            fresh = self._guide.draw(_guide_key(key), self._num_envs)
+            fresh = self._guide.draw(keys[-2], self._num_envs)
             state = state.replace(guided=jnp.where(over, fresh, jnp.maximum(state.guided - 1, 0)))
-        keys = jax.random.split(key, self._num_envs)
         state = state.replace(
             replay=replay_buffer.insert(
                 state.replay, played.rows, result.finite & self._skill_learning.shown(state.seen)
             ),
-            seen=self._skill_learning.observe(state.seen, key, played),
-            env_state=jax.vmap(partial(reset_done, self._env))(env_state, ~result.finite, keys),
+            seen=self._skill_learning.observe(state.seen, keys[-1], played),
+            env_state=jax.vmap(partial(reset_done, self._env))(env_state, ~result.finite, keys[:-2]),
             env_steps=env_steps,
             broken=state.broken + jnp.sum(~result.finite).astype(jnp.int32),
         )
@@ -151,8 +151,3 @@ def with_first_goal(state: ActingState, success: jax.Array) -> ActingState:
     """Return ``state`` with the step of the first goal, if one of ``success[n]`` is above 0 for the first time."""
     reached = jnp.any(success > 0) & (state.first_goal_step == NEVER)
     return state.replace(first_goal_step=jnp.where(reached, state.env_steps, state.first_goal_step))
-
-
-def _guide_key(key: jax.Array) -> jax.Array:
-    """Return a key for the guide beside what ``key`` itself is used for."""
-    return jax.random.fold_in(key, 1)

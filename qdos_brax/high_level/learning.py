@@ -80,13 +80,13 @@ class Learning:
         self._offline = round(self._config.batch_size * self._config.offline_fraction)
         self._rate = rate_schedule(self._config.schedule, self._config.env_steps)
 
-    def init(self, high_level_key: jax.Array, bonus_key: jax.Array, labeller_key: jax.Array, hyper: Any) -> Learners:
-        """Return fresh learners."""
+    def init(self, keys: Learners, hyper: dict[str, jax.Array]) -> Learners:
+        """Return fresh learners, each from its key."""
         return Learners(
-            high_level=self._high_level.start(high_level_key, hyper),
-            bonus=self._bonus.init(bonus_key),
-            labeller=self._labeller.init(labeller_key),
-            skills=self._skill_learning.init(jax.random.fold_in(high_level_key, 1), hyper),
+            high_level=self._high_level.start(keys.high_level, hyper),
+            bonus=self._bonus.init(keys.bonus),
+            labeller=self._labeller.init(keys.labeller),
+            skills=self._skill_learning.init(keys.skills, hyper),
         )
 
     def step(
@@ -106,7 +106,7 @@ class Learning:
         (key, newest), hyper = given, self._decayed(sources.hyper, env_steps)
         sources = sources._replace(hyper=hyper)
         active = env_steps >= self._labels.start_env_steps
-        label_key, actor_key, critic_key = jax.random.split(key, 3)
+        label_key, actor_key, critic_key, skill_key = jax.random.split(key, 4)
         bonus = self._bonus.learn(learners.bonus, newest.observation[None], newest.action[None], hyper, active)
         learners = learners.replace(bonus=bonus)
         learners = self._learn_rewards(learners, label_key, active, sources)
@@ -114,7 +114,7 @@ class Learning:
         earned = self._bonus.of(learners.bonus, newest.observation, newest.action, hyper)
         reference = self._reference(sources.skills, hyper)
         lesson = Lesson(sources.skills, sources.seen, high_level, reference, env_steps, hyper)
-        skills, skill_info = self._skill_learning.learn(learners.skills, jax.random.fold_in(key, 1), lesson)
+        skills, skill_info = self._skill_learning.learn(learners.skills, skill_key, lesson)
         learners = learners.replace(high_level=high_level, skills=skills)
         return learners, info | {"bonus": jnp.mean(earned)} | skill_info
 

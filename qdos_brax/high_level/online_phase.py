@@ -153,12 +153,13 @@ class OnlinePhase(MemberPhase):
 
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> OnlinePhaseState:
         """Return fresh learners, an empty replay, environments at their starts."""
-        high_level_key, bonus_key, labeller_key, env_key, key = jax.random.split(key, 5)
+        high_level_key, bonus_key, labeller_key, env_key, key, skill_key = jax.random.split(key, 6)
+        keys = Learners(high_level_key, bonus_key, labeller_key, skill_key)
         observation = jnp.zeros(self._high_level.observation_dim)
         row = Transition(observation, jnp.zeros(self._high_level.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
         return OnlinePhaseState(
             key=key,
-            learners=self.learning.init(high_level_key, bonus_key, labeller_key, hyper),
+            learners=self.learning.init(keys, hyper),
             acting=self._acting.start(env_key, row),
             update=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),
@@ -187,9 +188,10 @@ class OnlinePhase(MemberPhase):
         keys = jax.random.split(update_key, self._num_envs)
         learners, losses = jax.lax.scan(learn, state.learners, (keys, newest))
 
-        learners, healthy = health.keep_finite(state.healthy, learners, state.learners)
-        learns = self._warm_up.learns(acting.env_steps)
+        # Not from an empty replay, whose rows are NaN: the simulation may break in the very first macro step.
+        learns = self._warm_up.learns(acting.env_steps) & (acting.replay.size > 0)
         learners = jax.tree.map(lambda new, old: jnp.where(learns, new, old), learners, state.learners)
+        learners, healthy = health.keep_finite(state.healthy, learners, state.learners)
         update = state.update + jnp.where(learns, self._num_envs * self._utd, 0)
         state = state.replace(key=key, learners=learners, acting=acting, healthy=healthy, update=update)
         return state, info | jax.tree.map(jnp.mean, losses)

@@ -130,7 +130,7 @@ class TunedSkills:
 
     def conduct(self, seen: Seen, key: jax.Array, hyper: dict[str, jax.Array]) -> Conduct:
         """Return which environments play the correction, and the noise, which all have."""
-        noise = jax.random.normal(jax.random.fold_in(key, 2), (self._num_envs, self._horizon, self._action_dim))
+        noise = jax.random.normal(key, (self._num_envs, self._horizon, self._action_dim))
         return Conduct(seen.guard.tuned.astype(jnp.float32), hyper["tuning.noise"] * noise)
 
     def player(self, agent: Agent, conduct: Conduct) -> Play:
@@ -154,9 +154,7 @@ class TunedSkills:
         )
         replay = replay_buffer.insert(seen.replay, tracks, result.finite)
         tries = played.env_steps >= self._config.start_env_steps
-        guard = self._guard.observe(
-            seen.guard, jax.random.fold_in(key, 2), result.episode_return, played.over, result.finite, tries
-        )
+        guard = self._guard.observe(seen.guard, key, result.episode_return, played.over, result.finite, tries)
         return Seen(replay, guard)
 
     def learn(self, learned: Tuned, key: jax.Array, lesson: Lesson) -> tuple[Tuned, dict[str, jax.Array]]:

@@ -81,8 +81,7 @@ def build_phases(context: BuildContext) -> list[MemberPhase]:
     low_level, high_level = make_low_level(config, env), make_actor_critic(config, env)
     if method.policy is not None:
         return [_policy_phase(context, method.policy)]
-    high = config.high_level
-    labelled = round(high.batch_size * high.offline_fraction) > 0 or high.initial != "random"
+    labelled = _online_reads_labels(config) or config.high_level.initial != "random"
     guide = None if method.guide is None else _GUIDES[method.guide](config, env)
     return [
         *skill_phases(context),
@@ -157,7 +156,14 @@ def _warm_start_phases(context: BuildContext, low_level: LowLevelPolicy) -> list
         return []
     sac = SAC(context.env.observation_size, low_level.width, config.high_level)
     learner = WarmStart(sac, config.high_level.hidden, config.skills.horizon, config.flow)
-    return [offline_phase(context, AGENT, learner, config.flow.updates, labelled=True)]
+    labels = ("labels",)
+    drops = () if _online_reads_labels(config) else labels
+    return [offline_phase(context, AGENT, learner, config.flow.updates, reads=labels, drops=drops)]
+
+
+def _online_reads_labels(config: Config) -> bool:
+    """Return whether some of an online batch is labelled data."""
+    return round(config.high_level.batch_size * config.high_level.offline_fraction) > 0
 
 
 def _warm_up(config: Config, method: Method) -> WarmUp:

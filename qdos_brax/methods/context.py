@@ -50,7 +50,8 @@ def offline_phase(
     learner: Learner,
     updates: int,
     evaluation: Evaluation | None = None,
-    labelled: bool = False,
+    reads: tuple[str, ...] = (),
+    drops: tuple[str, ...] = (),
 ) -> OfflinePhase:
     """Return the phase that trains a learner on the data; it leaves the learner's parameters under ``name``."""
-    return OfflinePhase(name, learner, context.normaliser, updates, evaluation, labelled)
+    return OfflinePhase(name, learner, context.normaliser, updates, evaluation, reads, drops)

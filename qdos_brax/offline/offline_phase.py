@@ -61,7 +61,8 @@ class OfflinePhase(MemberPhase):
         normaliser: of observations.
         updates: gradient steps.
         evaluation: of a policy, or None.
-        labelled: whether the learner reads the data's labels, which an earlier phase left.
+        reads: what the learner reads of the artifacts, as a field of the data: ("labels",) or nothing.
+        drops: what no later phase reads.
         updates_per_chunk: gradient steps between two looks of the host.
     """
 
@@ -72,14 +73,15 @@ class OfflinePhase(MemberPhase):
         normaliser: Normaliser,
         updates: int,
         evaluation: Evaluation | None = None,
-        labelled: bool = False,
+        reads: tuple[str, ...] = (),
+        drops: tuple[str, ...] = (),
         updates_per_chunk: int = 500,
     ) -> None:
         every = updates if evaluation is None else evaluation.every_updates
         self._updates = min(updates_per_chunk, updates, every)
         super().__init__(name, "pretrain", -(-updates // self._updates))
         self._learner, self._normalise, self._evaluation = learner, normaliser, evaluation
-        self._reads = ("labels",) if labelled else ()
+        self._reads, self._drops = reads, drops
         self._evaluate_every = max(1, round(every / self._updates))
 
     def bind(self, population: Population, data: DeviceData) -> None:
@@ -95,21 +97,23 @@ class OfflinePhase(MemberPhase):
         chunk = int(metrics["update"][0]) // self._updates
         if self._evaluation is not None and (chunk % self._evaluate_every == 0 or chunk == self.num_chunks):
             started = time.perf_counter()
-            # A key that no update uses, so that evaluating does not change what is learned.
-            keys = jax.vmap(jax.random.fold_in)(state.key, state.update)
+            # A key that no update uses, so that evaluating does not change what is learned: fold_in(key, i) is
+            # split(key, n)[i], and the next chunk uses those up to its number of updates.
+            keys = jax.vmap(jax.random.fold_in)(state.key, jnp.maximum(state.update, self._updates + 1))
             episodes = self._evaluate(self._learner.params(state.learner), keys, self.data)
             metrics |= summary(episodes) | {"eval_seconds": time.perf_counter() - started}
         return state, metrics
 
     def constants(self, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Return the labels, where the learner reads them."""
+        """Return what the learner reads."""
         return {name: artifacts[name] for name in self._reads}
 
     def finish(self, state: OfflinePhaseState, artifacts: dict[str, Any]) -> dict[str, Any]:
         """Return the artifacts with the learner's parameters under the phase's name, and their normaliser."""
         normaliser = self._normalise.repeated(state.update.shape[0])
         learned = {self.name: self._learner.params(state.learner), "normaliser": normaliser}
-        return artifacts | learned | {health.KEY: state.healthy}
+        kept = {name: value for name, value in artifacts.items() if name not in self._drops}
+        return kept | learned | {health.KEY: state.healthy}
 
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> OfflinePhaseState:
         """Return a fresh learner."""

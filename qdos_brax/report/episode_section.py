@@ -10,7 +10,7 @@ import matplotlib.image
 import numpy as np
 
 from qdos_brax.report.elements import PALETTE, Figure, Film, Image, Section, axis_layout, json_numbers, member_id
-from qdos_brax.report.latent_trajectory import decision_at, latent_trajectory, parts_done
+from qdos_brax.report.latent_trajectory import latent_trajectory, moment, parts_done
 from qdos_brax.report.maps import MAP_HEIGHT, dots, goal_star, map_layout, path_line
 from qdos_brax.report.member_analysis import MemberAnalysis
 
@@ -91,16 +91,9 @@ def _films(analysis: MemberAnalysis) -> list[Film]:
 
 def _images(analysis: MemberAnalysis) -> list[Image]:
     return [
-        Image(
-            _moment(analysis, step), _jpeg(frame), f"The scene at {_moment(analysis, step)}{_measured(analysis, step)}"
-        )
+        Image(moment(analysis, step), _jpeg(frame), f"The scene at {moment(analysis, step)}{_measured(analysis, step)}")
         for step, frame in _frames(analysis)
     ]
-
-
-def _moment(analysis: MemberAnalysis, step: int) -> str:
-    decision = decision_at(analysis, step)
-    return f"step {step}" + ("" if decision is None else f", decision {decision}")
 
 
 def _measured(analysis: MemberAnalysis, step: int) -> str:

@@ -44,6 +44,12 @@ def picture_decisions(analysis: MemberAnalysis) -> list[int]:
     return [found for step in steps if (found := decision_at(analysis, int(step))) is not None]
 
 
+def moment(analysis: MemberAnalysis, step: int) -> str:
+    """Return a step of the episode in words, with its decision: two pictures of one decision differ in the step."""
+    decision = decision_at(analysis, step)
+    return f"step {step}" + ("" if decision is None else f", decision {decision}")
+
+
 def parts_done(analysis: MemberAnalysis, step: int) -> str:
     """Return which parts of the task are done at a step of the episode, in words; "" for a task without parts."""
     names = part_names(analysis)[1:-1]

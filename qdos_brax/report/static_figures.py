@@ -19,7 +19,7 @@ from qdos_brax.report.analysis_sections import PROGRESS, SKILL_SETS, skill_colou
 from qdos_brax.report.curves import save_figure, setting_colours
 from qdos_brax.report.elements import PALETTE
 from qdos_brax.report.episode_section import DISTANCE
-from qdos_brax.report.latent_trajectory import SKILLS_COLOUR, picture_decisions
+from qdos_brax.report.latent_trajectory import SKILLS_COLOUR, moment, picture_decisions
 from qdos_brax.report.member_analysis import (
     WALL_COLOUR,
     MemberAnalysis,
@@ -123,9 +123,10 @@ def _trajectory(axes: Iterable[Axes], analysis: MemberAnalysis) -> None:
     for decision in set(decisions):
         plane.annotate(str(decision), places[decision], (0, 5), textcoords="offset points", ha="center")
     plane.set(xticks=[], yticks=[], xlabel="t-SNE of latents; grey: segments of the data")
-    for scene, frame, decision in zip(scenes, analysis.own.get("frames", ()), decisions, strict=False):
+    pictures = (analysis.own.get("frames", ()), analysis.own.get("frame_steps", ()))
+    for scene, frame, step in zip(scenes, *pictures, strict=False):
         scene.imshow(frame)
-        scene.set(xticks=[], yticks=[], xlabel=f"decision {decision}")
+        scene.set(xticks=[], yticks=[], xlabel=moment(analysis, int(step)))
 
 
 def _scatter_latents(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,20 @@ def sha256(path: Path) -> str:
     """Return the SHA-256 of a file as 64 hex digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sha256_once(path: Path) -> str:
+    """Return ``sha256``, without reading the file again in this process while its size and time of change stay.
+
+    For data, which is large and is asked for by a run that continues, by each run of a comparison, and by each share.
+    """
+    status = path.stat()
+    return _sha256_of(path.absolute(), status.st_size, status.st_mtime_ns)
+
+
+@functools.cache
+def _sha256_of(path: Path, size: int, changed: int) -> str:
+    return sha256(path)
 
 
 def fingerprints(folder: Path, without: str) -> dict[str, list[Any]]:

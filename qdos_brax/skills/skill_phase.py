@@ -117,14 +117,14 @@ class SkillPhase(MemberPhase):
 
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> SkillPhaseState:
         """Return fresh networks."""
-        model_key, weights_key, key = jax.random.split(key, 3)
+        model_key, weights_key, key, information_key = jax.random.split(key, 4)
         params = self._model.init(model_key, self._view)
         return SkillPhaseState(
             key=key,
             params=params,
             opt_state=ADAM.init(params),
             weights=self._weights.init(weights_key),
-            information={} if self._information is None else self._information.init(jax.random.fold_in(key, 0)),
+            information={} if self._information is None else self._information.init(information_key),
             alpha=self._alpha.start(),
             update=jnp.zeros((), jnp.int32),
             broken=jnp.zeros((), jnp.int32),
@@ -146,13 +146,13 @@ class SkillPhase(MemberPhase):
         self, state: SkillPhaseState, key: jax.Array, data: DeviceData, hyper: Any, artifacts: Any
     ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
         """One batch of rollouts, then ``mi_every`` gradient steps on it and on fresh segments."""
-        rollout_key, latent_key, update_key = jax.random.split(key, 3)
+        rollout_key, latent_key, update_key, error_key = jax.random.split(key, 4)
         played = None
         if self._information is not None:
             state, rollout = self._roll_out(state, rollout_key, latent_key, data, hyper, artifacts)
             information, played = self._information.receive(state.information, state.params, rollout)
             state = state.replace(information=information)
-            error = partial(self._unreadable, state, played, rollout.weight, rollout_key, hyper)
+            error = partial(self._unreadable, state, played, rollout.weight, error_key, hyper)
             state = state.replace(alpha=self._alpha.after_rollouts(state.alpha, error, self._skills.mi_every, hyper))
         update = partial(self._update, data=data, hyper=hyper, artifacts=artifacts, played=played)
         return jax.lax.scan(update, state, jax.random.split(update_key, self._skills.mi_every))
@@ -192,13 +192,12 @@ class SkillPhase(MemberPhase):
     def _update(
         self, state: SkillPhaseState, key: jax.Array, data: DeviceData, hyper: Any, artifacts: Any, played: Any
     ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
-        index_key, sample_key = jax.random.split(key)
+        index_key, sample_key, learn_key, loss_key = jax.random.split(key, 4)
         index = jax.random.randint(index_key, (self._skills.batch_size,), 0, data.starts.shape[0])
         batch = self._batch(state, data, index)
         state = state.replace(weights=self._weights.learn(state.weights, batch, artifacts, hyper))
         weight = self._weight(state, batch, artifacts, hyper)
         segments = self._segments(data, index)
-        learn_key, loss_key = jax.random.split(jax.random.fold_in(key, 0))
         state, found = self._learn_information(state, segments, learn_key)
 
         def loss(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:

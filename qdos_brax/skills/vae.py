@@ -91,11 +91,11 @@ class SkillModel:
     def context(self, params: dict[str, Params], observation: jax.Array, skill: jax.Array) -> jax.Array:
         """Return what the decoder is shown, [..., seen + z]: the view of an observation, and the latent."""
         latent, pose = skill[..., : self.latent_dim], skill[..., self.latent_dim :]
-        return jnp.concatenate([self._see(params, observation, pose), latent], axis=-1)
+        return _context(self._see(params, observation, pose), latent)
 
     def decode_seen(self, params: dict[str, Params], seen: jax.Array, latent: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return pi(a | s, z) of what the view shows of s, ``seen[..., seen]``, and z[..., latent]."""
-        return self._decoder.apply(params["decoder"], jnp.concatenate([seen, latent], axis=-1))
+        return self._decoder.apply(params["decoder"], _context(seen, latent))
 
     def see_along(self, params: dict[str, Params], observations: jax.Array) -> jax.Array:
         """Return what the view shows of observations[B, H, obs] in a skill begun at the first of them, [B, H, seen]."""
@@ -181,3 +181,8 @@ class SkillModel:
 
     def _see(self, params: dict[str, Params], observation: jax.Array, pose: jax.Array) -> jax.Array:
         return self.view.see(params.get("view", {}), observation, pose)
+
+
+def _context(seen: jax.Array, latent: jax.Array) -> jax.Array:
+    """Return what the decoder is shown, [..., seen + z], of what the view shows and z."""
+    return jnp.concatenate([seen, latent], axis=-1)

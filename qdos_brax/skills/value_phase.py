@@ -124,16 +124,20 @@ def over_rows(function: Callable[..., Any], *arrays: jax.Array) -> Any:
 
 
 def sample_batch(data: DeviceData, key: jax.Array, size: int, n_step: int, discount: jax.Array) -> ValueBatch:
-    """Return ``size`` n-step transitions, uniform over the windows of the data.
+    """Return ``size`` transitions of ``n_step`` steps, or as many as their episode has left, uniform over the rows.
 
-    ``n_step`` must not exceed the horizon for which ``data.starts`` were made.
+    An episode's last rows count too: success is there where the data ends with it.
     """
-    starts = data.starts[jax.random.randint(key, (size,), 0, data.starts.shape[0])]
-    reward, mask = macro_return(*window((data.rewards, data.masks), starts, n_step), discount)
+    first = jax.random.randint(key, (size,), 0, data.rewards.shape[0])
+    last = jnp.minimum(first + n_step - 1, data.last[first])
+    rows = first[:, None] + jnp.arange(n_step)
+    inside, rows = rows <= last[:, None], jnp.minimum(rows, last[:, None])
+    rewards, masks = jnp.where(inside, data.rewards[rows], 0.0), jnp.where(inside, data.masks[rows], 1.0)
+    reward, mask = macro_return(rewards, masks, discount)
     return ValueBatch(
-        observation=data.observations[starts],
-        action=data.actions[starts],
+        observation=data.observations[first],
+        action=data.actions[first],
         reward=reward,
-        discount=mask * discount**n_step,
-        next_observation=data.next_observations[starts + n_step - 1],
+        discount=mask * discount ** (last - first + 1),
+        next_observation=data.next_observations[last],
     )

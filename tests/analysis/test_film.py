@@ -128,11 +128,18 @@ def test_an_episode_in_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_which_states_become_pictures() -> None:
     """Those of the decisions 0, 7, 14 and 22, or of evenly spread ones if there are fewer, and the end."""
     assert pictures.picture_steps(281, 10).tolist() == [0, 70, 140, 220, 280]
-    assert pictures.picture_steps(222, 10).tolist() == [0, 70, 140, 220, 221]
-    assert pictures.picture_steps(221, 10).tolist() == [0, 70, 140, 210, 220]  # decisions 0 to 21
-    assert pictures.picture_steps(281, 20).tolist() == [0, 80, 180, 260, 280]  # of 14: 0, 4, 9, 13
+    assert pictures.picture_steps(232, 10).tolist() == [0, 70, 140, 220, 231]  # decisions 0 to 23
+    assert pictures.picture_steps(231, 10).tolist() == [0, 70, 140, 210, 230]  # of 0 to 21; the end is that of 22
+    assert pictures.picture_steps(281, 20).tolist() == [0, 80, 160, 240, 280]  # of 0 to 12: 0, 4, 8, 12
     assert pictures.picture_steps(281, None).tolist() == [0, 56, 112, 168, 224, 280]
     assert pictures.picture_steps(3, 10).tolist() == [0, 2] and pictures.picture_steps(3, None).tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("states", range(12, 260, 7))
+def test_no_two_pictures_are_of_one_decision(states: int) -> None:
+    decisions = -(-(states - 1) // 10)
+    shown = np.minimum(pictures.picture_steps(states, 10) // 10, decisions - 1)
+    assert len(set(shown.tolist())) == len(shown) == min(5, decisions)
 
 
 def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -109,6 +112,42 @@ def test_inside_and_its_page(analysed: Path, opengl_or_not: bool) -> None:
 
     (analysed / "inside.npz").write_bytes((analysed / "inside.npz").read_bytes()[:1000])
     assert read_analyses(study)[0] == [] and "delete it" in read_analyses(study)[1][0]
+
+
+def test_one_members_map_is_laid_out_while_the_next_one_plays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    second_plays, overlapped = threading.Event(), []
+
+    def play(trained: Any, runner: Any, member: int) -> Any:
+        if member == 4:
+            second_plays.set()
+        return SimpleNamespace(latents=np.full((1, 2), member))
+
+    def lay_out(latents: np.ndarray, decisions: np.ndarray) -> dict[str, np.ndarray]:
+        overlapped.append(second_plays.wait(5))
+        return {"tsne_episode": decisions}
+
+    view = SimpleNamespace(of=lambda member: {"latent": np.zeros((1, 2))} if member else {})
+    stand_ins = {
+        "on_mujoco_c": lambda trained: trained,
+        "_sample": lambda *_: None,
+        "_first_seeds": lambda trained: [1, 4, 0],
+        "_truth": lambda *_: {},
+        "_weights": lambda trained, member, sample: {"weight": np.asarray([member])},
+        "_LatentView": lambda *_: view,
+        "EpisodeRunner": lambda trained: None,
+        "play_episode": play,
+        "measure_episode": lambda *_: {},
+        "embedded": lay_out,
+    }
+    for name, stand_in in stand_ins.items():
+        monkeypatch.setattr(inside, name, stand_in)
+    env = SimpleNamespace(floor_map=lambda: None)
+    trained: Any = SimpleNamespace(env=env, config=SimpleNamespace(skills=SimpleNamespace(horizon=HORIZON)))
+    inside.look_inside(trained, SimpleNamespace(), tmp_path / "inside.npz")  # type: ignore[arg-type]
+    assert overlapped == [True, True]
+    with np.load(tmp_path / "inside.npz") as found:
+        assert [found[f"{member}/tsne_episode"].tolist() for member in (1, 4)] == [[[1, 1]], [[4, 4]]]
+        assert found["4/weight"] == [4] and "0/tsne_episode" not in found
 
 
 @pytest.fixture

@@ -197,7 +197,6 @@ def test_bad_files(what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     [
         (["--set", "skills.horizon=41"], "no episode has 41 steps"),
         (["--method", "rlpd", "--set", "skills.horizon=2"], "skills.horizon must stay 1, not 2"),
-        (["--set", "values.estimator=iql", "--set", "skills.horizon=5"], "values.n_step (10) must not exceed"),
         (["--set", "skills.horizon=0"], "skills.horizon"),
         (["--method", "nosuch"], "there is no method 'nosuch'"),
         (["--set", "skills.horizno=5"], "did you mean 'skills.horizon'"),

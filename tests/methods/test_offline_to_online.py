@@ -52,6 +52,7 @@ def test_a_warm_start_goes_on_without_the_data_and_reaches_the_optimum_of_the_pl
     label, agent, online = phases_of(config, point_dataset())
     _, _, artifacts = run_phase(label, jax.random.split(jax.random.key(0), 1), {})
     _, _, artifacts = run_phase(agent, jax.random.split(jax.random.key(1), 1), artifacts)
+    assert set(artifacts) == {"agent", "normaliser", "healthy"}  # the labels have served
     state, constants = online.init(jax.random.split(jax.random.key(2), 1), artifacts)
     history = []
     for _ in range(online.num_chunks):
@@ -78,3 +79,4 @@ def test_skills_can_be_played_by_a_warm_start_too() -> None:
     assert history[-1]["update"][0] == 10 and np.isfinite(history[-1]["critic_loss"]).all()
     assert -5.5 < history[-1]["q"][0] < -4  # of 5 steps that mostly cost 1 each
     assert set(artifacts["agent"]) >= {"actor", "critic", "critic_opt_state"}
+    np.testing.assert_array_equal(artifacts["labels"], labels)  # half of an online batch is labelled data

@@ -29,6 +29,7 @@ from qdos_brax.report.write import write_report
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
 from qdos_brax.runs.metrics import read_rows
+from qdos_brax.skills.chunks import ActionChunks
 from qdos_brax.skills.information import PhysicsRollout
 from qdos_brax.skills.information_terms import SegmentTerm
 from qdos_brax.skills.low_level import TrajectorySkills
@@ -62,7 +63,7 @@ def phases() -> dict[str, Any]:
     phases = {
         "values": ValuePhase(config, IQL(2, 2, (16,)), updates_per_chunk=10),
         "skills": SkillPhase(config, model, LoggedWeights(), information, blocks_per_chunk=1),
-        "policy": OfflinePhase("policy", policy, normaliser, 20, None, 10),
+        "policy": OfflinePhase("policy", policy, normaliser, 20, updates_per_chunk=10),
         "label": LabelPhase(config.skills.horizon, len(data.starts), low_level),
         "online": online,
     }
@@ -167,6 +168,40 @@ def test_what_breaks_in_the_skill_phase_stays_where_it_arose(breaking: tuple[Ski
         np.testing.assert_array_equal(a[1], c[1])
     handed_on = phase.finish(state, artifacts)
     np.testing.assert_array_equal(phase.init(keys, handed_on)[0].healthy, [True, False, True])
+
+
+class BreakingStartEnv(PointEnv):
+    """Breaks in the first step of episodes that start on the right, about half of them."""
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        broken = (state.info["steps"] == 0) & (state.pipeline_state.qpos[0] > 0)
+        state = super().step(state, action)
+        obs = jnp.where(broken, jnp.nan, state.obs)
+        return state.replace(obs=obs, info=state.info | {"final_obs": obs})
+
+
+def test_a_simulation_that_breaks_before_anything_is_stored_costs_no_member_its_health() -> None:
+    """There is nothing to learn from yet, and nothing is learned."""
+    values = {"high_level.num_envs": 1, "high_level.offline_fraction": 0.0, "high_level.utd": 2}
+    config = configs.replace(point_config(**values), seed=(0, 1, 2, 3))
+    data, normaliser = to_device(point_dataset(episodes=4), config.skills.horizon)
+    low_level = ActionChunks(2, config.skills.horizon)
+    sac, warm_up = SAC(2, low_level.width, config.high_level), RandomWarmUp(0)
+    phase = OnlinePhase(
+        config, BreakingStartEnv(), normaliser, low_level, sac, warm_up, DataReward(), NoBonus(), steps_per_chunk=5
+    )
+    bound(phase, config, data)
+    start, constants = phase.init(jax.vmap(jax.random.key)(np.arange(4, dtype=np.uint32)), {})
+    before = jax.tree.map(np.asarray, start.learners.high_level)
+    state, metrics = phase.chunk(start, constants)
+    broke = metrics["broken_envs"] == 1
+    assert broke.any() and not broke.all() and metrics["status_ok"].all()
+    np.testing.assert_array_equal(metrics["update"], np.where(broke, 0, 2))
+    for a, b in zip(*map(jax.tree.leaves, (before, jax.tree.map(np.asarray, state.learners.high_level))), strict=True):
+        np.testing.assert_array_equal(a[broke], b[broke])
+    for _ in range(8):
+        state, metrics = phase.chunk(state, constants)
+    assert metrics["status_ok"].all() and (metrics["update"] > 0).all()
 
 
 @pytest.mark.parametrize("engine", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])

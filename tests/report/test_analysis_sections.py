@@ -119,6 +119,24 @@ def test_everything_found_is_shown(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").read_text().count('<img src="data:image/jpeg;base64,') == 2 + 1
 
 
+def test_pictures_of_one_decision_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The episode of 41 states has decisions at 0 and 20; the last one's beginning and end are both shown."""
+    shown: list[str] = []
+    monkeypatch.setattr(
+        static_figures,
+        "save_figure",
+        lambda figure, out: shown.extend(axes.get_xlabel() for axes in figure.axes) if out.stem == "trajectory" else 0,
+    )
+    run = write_run(tmp_path / "run", success=[0.5, 0.7])
+    write_inside(run)
+    study = read_study([run])
+    (analysis,), _ = read_analyses(study)
+    own = analysis.own | {"frames": np.zeros((3, 6, 8, 3), np.uint8), "frame_steps": np.asarray([0, 20, 40])}
+    static_figures.draw_static_figures(study, [analysis._replace(own=own)], tmp_path)
+    assert shown[1:4] == ["step 0, decision 0", "step 20, decision 1", "step 40, decision 1"]
+    plt.close("all")
+
+
 def test_what_was_not_found_is_left_out(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", success=[0.5, 0.7])
     assert read_analyses(read_study([run])) == ([], [])

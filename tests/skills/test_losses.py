@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from qdos_brax import config as configs
+from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.device import Normaliser, to_device
 from qdos_brax.nn.networks import gaussian_kl, gaussian_sample
 from qdos_brax.skills.vae import Segments, SkillModel
+from qdos_brax.skills.value_phase import sample_batch
 from qdos_brax.skills.values import IQL, ValueBatch, expectile_loss
 from qdos_brax.skills.weights import (
     advantage_weights,
@@ -40,6 +43,29 @@ def test_critic_target_is_the_n_step_return():
     target = np.array([-3 + 0.9**4 * value, -1.0])
     expected = np.mean((q[0] - target) ** 2) + np.mean((q[1] - target) ** 2)
     np.testing.assert_allclose(iql.critic_loss(state.critic, state.value, batch), expected, rtol=1e-5)
+
+
+def test_values_see_every_row_and_an_episodes_last_ones_too():
+    """Episodes of 4 and 3 rows, two-step returns at discount 1/2; the first episode ends in success, at its last row.
+
+    Of a method whose segments are longer than the return (here 3 rows), the last rows count as well.
+    """
+    rows = np.arange(7, dtype=np.float32)
+    dataset = Dataset(
+        observations=rows[:, None],
+        actions=np.zeros((7, 1), np.float32),
+        rewards=np.array([-1, -2, -3, 0, -5, -6, -7], np.float32),
+        masks=np.array([1, 1, 1, 0, 1, 1, 1], np.float32),
+        ends=np.array([0, 0, 0, 1, 0, 0, 1], bool),
+        next_observations=rows[:, None] + 1,
+    )
+    data, _ = to_device(dataset, 3, Normaliser(jnp.zeros(1), jnp.ones(1)))
+    batch = jax.tree.map(np.asarray, sample_batch(data, jax.random.key(0), 7000, 2, 0.5))
+    row = batch.observation[:, 0].astype(int)
+    assert np.bincount(row, minlength=7).min() > 800
+    np.testing.assert_array_equal(batch.reward, np.array([-2, -3.5, -3, 0, -8, -9.5, -7])[row])
+    np.testing.assert_array_equal(batch.discount, np.array([0.25, 0.25, 0, 0, 0.25, 0.25, 0.5])[row])
+    np.testing.assert_array_equal(batch.next_observation[:, 0], np.array([2, 3, 4, 4, 6, 7, 7])[row])
 
 
 def test_advantages_by_hand():

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from qdos_brax.collection.experts.records import CurveRow, command_line, read_curve
 from qdos_brax.collection.experts.tasks import TASKS
 from qdos_brax.collection.experts.trainer import Sizes, Trainer
 from qdos_brax.collection.experts.weights import Actor, write_actor
@@ -27,6 +28,8 @@ from qdos_brax.errors import UserError
 from qdos_brax.files import write_arrays, write_text
 from qdos_brax.high_level.sac import SACState
 from qdos_brax.runs.checkpoint import CheckpointStore, Position, choose
+
+_RECORDED = ("steps", "seed", "learner", "width", "batch_size", "updates_per_step")  # flags, with the weights
 
 
 class Training:
@@ -57,7 +60,7 @@ class Training:
         self.has_learner = learner is not None
         self.state = trainer.init(train_key, given)
         self.chunks_done, self.seconds = 0, 0.0
-        self.rows: list[dict[str, float]] = []
+        self.rows: list[CurveRow] = []
         choose(self.store, self._restore, print)
 
     def run(self, steps: int, command: str = "") -> None:
@@ -76,12 +79,12 @@ class Training:
             info = {name: float(value) for name, value in info.items()}
             self.seconds += time.monotonic() - began
             self.chunks_done += 1
-            row: dict[str, float] = {"steps": self.chunks_done * per_chunk, "seconds": round(self.seconds)}
+            row: CurveRow = {"steps": self.chunks_done * per_chunk, "seconds": round(self.seconds)}
             print(" ".join(f"{key}={value:.4g}" for key, value in (row | info).items()), flush=True)
             if self.chunks_done % self.chunks_per_save == 0 or self.chunks_done == last:
                 self._save(row, command)
 
-    def _save(self, row: dict[str, float], command: str) -> None:
+    def _save(self, row: CurveRow, command: str) -> None:
         reached = self.trainer.evaluate(self.state.average, self.evaluate_key)
         row = row | {name: float(f"{float(value):.5g}") for name, value in reached.items()}
         self.rows.append(row)
@@ -98,12 +101,10 @@ class Training:
         position = self.store.position(name)
         self.state = self.store.restore(name, self.state)
         self.chunks_done, self.seconds = position.chunk, position.wall_seconds["train"]
-        with open(self.folder / f"{self.name}.csv", encoding="utf-8") as file:
-            rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-        self.rows = rows[: position.rows]
+        self.rows = read_curve(self.folder / f"{self.name}.csv")[: position.rows]
 
 
-def _csv_text(rows: list[dict[str, float]]) -> str:
+def _csv_text(rows: list[CurveRow]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
     writer.writeheader()
@@ -151,15 +152,7 @@ def main() -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     sizes = Sizes(hidden=(args.width,) * 2, batch_size=args.batch_size, updates_per_step=args.updates_per_step)
     training = Training(Trainer(TASKS[args.expert](), sizes), args.out, args.seed, args.learner)
-    training.run(args.steps, _command(args))
-
-
-def _command(args: argparse.Namespace) -> str:
-    """Return the command line as it is recorded with the weights, without folders."""
-    given = {**vars(args), "learner": args.learner and args.learner.name}
-    names = ("steps", "seed", "learner", "width", "batch_size", "updates_per_step")
-    flags = [f"--{name.replace('_', '-')} {given[name]}" for name in names if given[name] is not None]
-    return " ".join(["python -m qdos_brax.collection.experts.train", args.expert, *flags])
+    training.run(args.steps, command_line("train", args.expert, args, _RECORDED))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ state of a search, from which ``--start`` begins another one, ``NAME.csv``, its 
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
 
@@ -21,12 +20,14 @@ from envs.physics.mujoco.engine import MujocoEngine
 from qdos_brax.collection.experts import falls, rising
 from qdos_brax.collection.experts.evolution import Evolution, Search
 from qdos_brax.collection.experts.motion_goals import GOALS, MotionGoal
+from qdos_brax.collection.experts.records import CurveRow, command_line, read_curve
 from qdos_brax.collection.experts.rising import Motions
 from qdos_brax.collection.experts.weights import shipped
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_arrays, write_text
 
 STARTS = 128  # bodies that fell, from which a search draws
+_RECORDED = ("generations", "seed", "start", "spread", "population", "starts", "noise")  # flags, with the motions
 
 
 class MotionSearch:
@@ -58,7 +59,7 @@ class MotionSearch:
         self.goal, self.evolution, self.starts = goal, evolution, starts
         self.path, self.curve = folder / f"{goal.name}-search.npz", folder / f"{goal.name}.csv"
         self.search = read_search(self.path, evolution.size) if self.path.exists() else begun
-        self.rows = _rows(self.curve) if self.path.exists() else []
+        self.rows = read_curve(self.curve) if self.path.exists() else []
         self._fallen = self._rested(motions)
         shaken = noise * (jnp.arange(starts) % 2)[:, None]
         self._score = jax.jit(lambda candidates, qpos, qvel, key: goal.score(candidates, qpos, qvel, shaken, key))
@@ -74,7 +75,7 @@ class MotionSearch:
                 write_arrays(self.path, {name: np.asarray(value) for name, value in self.search._asdict().items()})
                 write_text(self.curve, _text(self.rows))
 
-    def _generation(self) -> dict[str, float]:
+    def _generation(self) -> CurveRow:
         index = int(self.search.generation)
         candidates = self.evolution.ask(self.search)
         chosen = np.random.default_rng((self.evolution.seed, index, 1)).choice(len(self._fallen[0]), self.starts)
@@ -110,12 +111,7 @@ def read_search(path: Path, size: int) -> Search:
     return search
 
 
-def _rows(path: Path) -> list[dict[str, float]]:
-    with open(path, encoding="utf-8") as file:
-        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-
-
-def _text(rows: list[dict[str, float]]) -> str:
+def _text(rows: list[CurveRow]) -> str:
     lines = [",".join(rows[0]), *(",".join(f"{value:.5g}" for value in row.values()) for row in rows)]
     return "\n".join(lines) + "\n"
 
@@ -146,15 +142,8 @@ def main() -> None:
     search = MotionSearch(goal, motions, args.out, evolution, args.starts, args.noise, begun)
     search.run(args.generations)
     motions = motions._replace(**{args.motion: goal.motion(jnp.asarray(search.search.mean, jnp.float32))})
-    rising.write_motions(path, motions, header | {args.motion: _command(args)})
-
-
-def _command(args: argparse.Namespace) -> str:
-    """Return the command line as it is recorded with the motions, without folders."""
-    given = {**vars(args), "start": args.start and args.start.name}
-    names = ("generations", "seed", "start", "spread", "population", "starts", "noise")
-    flags = [f"--{name} {given[name]}" for name in names if given[name] is not None]
-    return " ".join(["python -m qdos_brax.collection.experts.train_motions", args.motion, *flags])
+    command = command_line("train_motions", args.motion, args, _RECORDED)
+    rising.write_motions(path, motions, header | {args.motion: command})
 
 
 if __name__ == "__main__":
