@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from qdos_brax.analysis import conclusion
 from qdos_brax.commands.train import train_main
 from qdos_brax.data import formats
 
+ROOT = Path(__file__).parents[1]
 TINY = (
     "--env antmaze-medium --preset smoke --pretrain-steps 2 --steps 160 --set data.transitions=1000 "
     "--set data.num_envs=4 --set labels.start_env_steps=80 --set high_level.warmup_env_steps=80 "
@@ -27,14 +30,15 @@ def test_a_scan_of_two_from_flags_to_page(
 ) -> None:
     monkeypatch.setenv("QDOS_DATA", str(tmp_path / "data"))
     run = tmp_path / "run"
-    calls = {name: counted(monkeypatch, module, name) for module, name in ((formats, "read"), (experiment, "sha256"))}
+    counts = ((formats, "read"), (experiment, "sha256_once"))
+    calls = {name: counted(monkeypatch, module, name) for module, name in counts}
     monkeypatch.setattr(conclusion, "load_run", refuse)  # what is in memory is not read again
     assert train_main(shlex.split(f"{TINY} --alpha 0.1,0.3 --seed 0,1 --zip --out {run}")) == 0
     printed = capsys.readouterr().out
     assert "members   2 members, " in printed and "done in" in printed
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     assert [(member["seed"], member["alpha"]) for member in summary["members"]] == [(0, 0.1), (1, 0.3)]
-    assert calls == {"read": [1], "sha256": [1]} and (run / "inside.npz").exists()
+    assert calls == {"read": [1], "sha256_once": [1]} and (run / "inside.npz").exists()
     assert f"  alpha 0.3, seed 1: success {summary['members'][1]['eval_success']:.2f} (best " in printed
     assert all(member["status"] == "ok" and member["env_steps"] == 160 for member in summary["members"])
     with (run / "metrics.csv").open(newline="") as file:
@@ -43,6 +47,13 @@ def test_a_scan_of_two_from_flags_to_page(
     assert (run / "report.html").stat().st_size > 0 and any((run / "tensorboard").rglob("events*"))
     assert train_main(["--resume", str(run)]) == 0  # it has finished: not run again
     assert "has finished already" in capsys.readouterr().out
+
+
+def test_a_process_that_ends_early_prints_nothing_of_what_it_loads_beside() -> None:
+    """A run that data is refused to ends with one line while modules for its report are still loading."""
+    code = "from qdos_brax.analysis.conclusion import load_beside; load_beside()"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "Traceback" not in done.stderr, done.stderr
 
 
 def test_alpha_is_printed_only_where_it_has_an_effect() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import sys
@@ -27,7 +28,15 @@ _AT_THE_END = ("qdos_brax.report.write", "qdos_brax.analysis.inside")
 def load_beside() -> None:
     """Load Matplotlib, SciPy's statistics and scikit-learn on a thread, while the run trains: 1.5 s for its end."""
     # No daemon: a process that ends early waits for it, since a thread that is killed within a C++ library aborts.
-    threading.Thread(target=lambda: [importlib.import_module(name) for name in _AT_THE_END]).start()
+    threading.Thread(target=_load).start()
+
+
+def _load() -> None:
+    # A process that is about to end allows no executors any more: no traceback after its one line. Who needs the
+    # modules imports them, and is told what is wrong.
+    with contextlib.suppress(Exception):
+        for name in _AT_THE_END:
+            importlib.import_module(name)
 
 
 def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[], tuple[TrainedRun, Dataset]]) -> None:
