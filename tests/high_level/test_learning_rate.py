@@ -12,7 +12,7 @@ import pytest
 from qdos_brax import config as configs
 from qdos_brax.data.transitions import Transition
 from qdos_brax.high_level import replay
-from qdos_brax.high_level.learning import Learning, Sources
+from qdos_brax.high_level.learning import Learners, Learning, Sources
 from qdos_brax.high_level.sac import SAC
 from qdos_brax.high_level.skill_learning import FrozenSkills
 from qdos_brax.labels.bonus import NoBonus
@@ -42,8 +42,7 @@ def test_a_step_is_as_long_as_the_schedule_says(schedule: str, env_steps: int, f
     hyper = {key: jnp.asarray(value[0]) for key, value in configs.population_hyper(config).items()}
     row = Transition(jnp.ones(2), jnp.ones(2) / 2, jnp.ones(()), jnp.ones(()), -jnp.ones(2))
     rows = replay.insert(replay.create(row, 4), jax.tree.map(lambda x: x[None], row))
-    keys = jax.random.split(jax.random.key(0), 3)
-    before = learning.init(*keys, hyper)
+    before = learning.init(Learners(*jax.random.split(jax.random.key(0), 4)), hyper)
     sources = Sources(rows, cast(Any, None), {}, {}, hyper)
     after, _ = learning.step(before, (jax.random.key(1), row), jnp.asarray(env_steps), sources)
     for part in ("actor", "critic"):
