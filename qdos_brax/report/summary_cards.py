@@ -119,7 +119,8 @@ def _wall_time_card(study: Study) -> Card:
     members = sum(len(run.members) for run in study.runs)
     share = f", {100 * seconds[longest] / total:.0f} % of it {longest}" if total else ""
     each = format_duration(total / max(members, 1))
-    return Card("Wall time", format_duration(total), f"{members} members: {each} each{share}.")
+    shared = "1 member" if members == 1 else f"{members} members: {each} each"
+    return Card("Wall time", format_duration(total), f"{shared}{share}.")
 
 
 def _seeds(count: int) -> str:

@@ -171,8 +171,9 @@ def test_summary_cards_by_hand(tmp_path: Path) -> None:
     assert "2 settings" in best.value and sure.value == "no clear difference"
     assert sure.text.startswith("No difference was found between qdos and supe (95 % interval of the probability")
     nothing = write_run(tmp_path / "n", success=[0.0])
-    best, sure, fastest, never, _ = summary_cards(read_study([nothing]))
+    best, sure, fastest, never, time = summary_cards(read_study([nothing]))
     assert (best.value, fastest.value) == ("none", "none") and "nothing to compare" in sure.text
+    assert time.text.startswith("1 member, ")
     assert never.value == "never reached the goal" and "--steps 8000" in never.text
 
 
