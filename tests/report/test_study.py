@@ -192,6 +192,14 @@ def test_advice_by_hand(success: list[float], verdict: str, says: str) -> None:
     assert found.verdict == verdict and says in found.text
 
 
+def test_a_smoke_run_is_not_advised_to_go_on(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "s", success=[0.0])
+    text = (run / "summary.json").read_text()
+    (run / "summary.json").write_text(text.replace('"preset": "paper"', '"preset": "smoke"'))
+    (card,) = [card for card in summary_cards(read_study([run])) if card.title == "How it went"]
+    assert card.value == "a smoke run" and "without --preset smoke" in card.text and "--steps" not in card.text
+
+
 def test_a_reader_is_warned(tmp_path: Path) -> None:
     a = write_run(tmp_path / "a", success=[0.5, None])
     b = write_run(tmp_path / "b", "supe", [0.5], data="e" * 64, more="high_level: {env_steps: 9000}\n")
