@@ -3,6 +3,7 @@
 #   docker run --rm qdos
 # Data and runs outlive the container in a volume:
 #   docker run --rm -v qdos:/home/qdos qdos train --env antmaze-large --out runs/large
+#   docker run --rm -v qdos:/home/qdos --entrypoint cat qdos runs/large/report.html > report.html
 FROM python:3.11-slim-bookworm
 
 # EGL and Mesa draw frames without a display; without them a report has no pictures.
@@ -16,7 +17,7 @@ COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY configs configs
 COPY envs envs
 COPY qdos_brax qdos_brax
-RUN pip install --no-cache-dir -c constraints.txt ".[video]"
+RUN pip install --no-cache-dir -c constraints.txt ".[manipulation,video]"
 
 USER qdos
 WORKDIR /home/qdos

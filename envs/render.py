@@ -117,6 +117,17 @@ def steps_per_second(env: Any) -> float:
     return 1.0 / (env.engine.frame_skip * env.engine.model.opt.timestep)
 
 
+def check_drawing() -> str:
+    """Return the way to OpenGL by which frames are drawn on this machine: "egl", "osmesa" or "glfw".
+
+    Raises:
+        NoOpenGL: this machine cannot draw.
+    """
+    gl, context = _open_contexts(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16)
+    _free(gl, context)
+    return type(gl).__module__.rpartition(".")[2]
+
+
 def _open_contexts(model: mujoco.MjModel, height: int, width: int) -> tuple[Any, mujoco.MjrContext]:
     """Return an OpenGL context, and in it the renderer's.
 

@@ -90,6 +90,12 @@ def test_envs_imports_nothing_of_ours() -> None:
         assert not [name for name in imported_modules(path) if name.startswith("qdos_brax")], path
 
 
+def test_brax_comes_in_by_one_door() -> None:
+    """Elsewhere MJX's lines about the absent package warp would be the first that a run prints."""
+    found = [p for p in sources("qdos_brax", "envs") if any(name.startswith("brax.") for name in imported_modules(p))]
+    assert found == [ROOT / "envs" / "brax_base.py"]
+
+
 def test_few_files_lie_at_the_top_and_none_is_long() -> None:
     assert len(list((ROOT / "qdos_brax").glob("*.py"))) <= TOP_FILES
     long = {

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import inspect
+import json
 from pathlib import Path
 
 import pytest
@@ -9,6 +13,24 @@ import pytest
 from qdos_brax.commands.main import main
 
 NOTEBOOK = Path(__file__).parents[1] / "docs" / "notebook.ipynb"
+
+
+@pytest.mark.quick
+def test_the_notebook_calls_our_functions_as_they_are() -> None:
+    """Names and numbers of arguments, so that a changed signature is seen before the slow test."""
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    tree = ast.parse("\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"))
+    ours = {
+        alias.name: getattr(importlib.import_module(node.module), alias.name)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("qdos_brax")
+        for alias in node.names
+    }
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ours]
+    assert {getattr(call.func, "id", "") for call in calls} == set(ours)
+    for call in calls:
+        signature = inspect.signature(ours[getattr(call.func, "id", "")])
+        signature.bind(*call.args, **{str(word.arg): None for word in call.keywords})
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Check this machine: installed packages, jax's devices, caches, and whether callbacks return."""
+"""Check this machine: installed packages, jax's devices, caches, whether callbacks return and frames can be drawn."""
 
 from __future__ import annotations
 
@@ -57,6 +57,7 @@ def examine() -> bool:
         _compile_cache,
         _data,
         _callbacks,
+        _drawing,
     )
     results = []
     for check in checks:
@@ -148,3 +149,13 @@ def _callbacks() -> tuple[bool, str]:
         reason = next(reversed(done.stderr.strip().splitlines()), "no message")
         return False, f"callbacks: failed ({reason}); MuJoCo C cannot be used, choose --physics mjx"
     return True, f"callbacks: compiled programs can call Python (by {done.stdout.strip()})"
+
+
+def _drawing() -> tuple[bool, str]:
+    """Say how frames are drawn; that none can be is no failure, because reports do without them."""
+    from envs.render import NoOpenGL, check_drawing
+
+    try:
+        return True, f"drawing: by {check_drawing()}"
+    except NoOpenGL as error:
+        return True, f"drawing: no frames in reports, no films: {error}"

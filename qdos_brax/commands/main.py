@@ -86,7 +86,7 @@ def main_parser(argv: Sequence[str], prog: str = _PROGRAM) -> Parser:
 
     add_config(commands)
 
-    doctor = commands.add_parser("doctor", help="check versions, devices, caches and callbacks of this machine")
+    doctor = commands.add_parser("doctor", help="check versions, devices, engines, caches and drawing on this machine")
     doctor.set_defaults(run=_doctor)
 
     completion = commands.add_parser("completion", help="print a script by which a shell completes the command qdos")

@@ -7,9 +7,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
 from flax import struct
 
+from envs.brax_base import Env, State
 from qdos_brax.config import Config
 from qdos_brax.data.device import Normaliser
 from qdos_brax.data.transitions import Transition

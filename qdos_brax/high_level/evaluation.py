@@ -8,8 +8,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
 
+from envs.brax_base import Env, State
 from qdos_brax.high_level.macro_step import macro_step
 
 

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
+
+from envs.brax_base import Env, State
 
 
 class MacroStep(NamedTuple):

@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env
 from flax import struct
 from flax.serialization import from_state_dict, to_state_dict
 
+from envs.brax_base import Env
 from qdos_brax.config import Config
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.data.transitions import Transition

@@ -8,9 +8,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env
 from flax import struct
 
+from envs.brax_base import Env
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.high_level.agent import Policy
 from qdos_brax.high_level.evaluation import Episodes, evaluate, summary

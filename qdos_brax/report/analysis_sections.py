@@ -143,11 +143,11 @@ def _skill_paths(analyses: list[MemberAnalysis]) -> Section:
         _skill_map(analysis, name, words) for analysis in analyses for name, words in SKILL_SETS if name in analysis.own
     ]
     text = (
-        "Each line is one skill, kept for the length of three segments from the task's start; the dot is its end. A "
-        "grid of skills: along the two directions in which the latents of the data vary most, up to two standard "
-        "deviations; the hue is the direction from the middle of the grid. From one skill to another: on a straight "
-        "line between the latents of two segments of the data, from blue to orange. Drag over a part of the map to "
-        "enlarge it."
+        "Each line is one skill, kept for the length of three segments from the task's start; the dot is its end, the "
+        "star the goal. A grid of skills: along the two directions in which the latents of the data vary most, up to "
+        "two standard deviations; the hue is the direction from the middle of the grid. From one skill to another: on "
+        "a straight line between the latents of two segments of the data, from blue to orange. Drag over a part of "
+        "the map to enlarge it."
     )
     return Section("Where skills lead", text, figures=figures)
 

@@ -33,8 +33,8 @@ def advise(steps: np.ndarray, success: np.ndarray, task: str) -> Advice:
     if best == 0:
         return Advice(
             "never reached the goal",
-            f"See whether the data visits it (python -m qdos_brax data check FILE --env {task} --map map.png) and how "
-            f"far the skills below get; then try {longer}.",
+            f"See whether the data visits it (python -m qdos_brax data check FILE --env {task} --map map.png; FILE is "
+            f"named at the end of this page) and how far the skills below get; then try {longer}.",
         )
     if last >= _LEARNED:
         return Advice("learned", "Compare it with other methods: --method qdos,supe --seed 0,1,2.")

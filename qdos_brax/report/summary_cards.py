@@ -105,10 +105,14 @@ def _first_goal_card(study: Study, task: str) -> Card:
 
 def _next_cards(study: Study, task: str, order: list[tuple[Setting, list[float]]]) -> list[Card]:
     """Return what the curve of the best setting suggests; nothing of a method that only learned offline."""
+    title = "How it went"
+    if {run.summary["preset"] for run in study.runs} == {"smoke"}:
+        text = "Its sizes only show that everything works; nothing is learned with them. Train without --preset smoke."
+        return [Card(title, "a smoke run", text)]
     for curve in curves(study, task, "eval/success"):
         if curve.setting is order[0][0] and not curve.offline:
             verdict, text = advise(curve.steps, curve.mean, task)
-            return [Card("How it went", verdict, text)]
+            return [Card(title, verdict, text)]
     return []
 
 
@@ -119,7 +123,8 @@ def _wall_time_card(study: Study) -> Card:
     members = sum(len(run.members) for run in study.runs)
     share = f", {100 * seconds[longest] / total:.0f} % of it {longest}" if total else ""
     each = format_duration(total / max(members, 1))
-    return Card("Wall time", format_duration(total), f"{members} members: {each} each{share}.")
+    shared = "1 member" if members == 1 else f"{members} members: {each} each"
+    return Card("Wall time", format_duration(total), f"{shared}{share}.")
 
 
 def _seeds(count: int) -> str:

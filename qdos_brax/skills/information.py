@@ -7,8 +7,8 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 
+from envs.brax_base import State
 from envs.task import Task
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.data.segments import window

@@ -11,6 +11,7 @@ import pytest
 
 import envs
 from envs import render
+from qdos_brax.commands import doctor
 
 LARGE = envs.make("antmaze-large", physics="mujoco")
 QPOS = np.asarray(LARGE.engine.model.qpos0)
@@ -129,6 +130,20 @@ def test_without_opengl_one_line_names_causes_and_mend(monkeypatch: pytest.Monke
     for part in ("egl: ImportError: no library for egl", "osmesa: ImportError: no library for osmesa"):
         assert part in message
     assert "apt-get install libegl1" in message and "libosmesa6" in message and "MUJOCO_GL" in message
+
+
+@pytest.mark.usefixtures("fresh_probe")
+def test_doctor_says_that_nothing_draws_and_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(render, "_PROBE", "raise ImportError('no library')")
+    passed, line = doctor._drawing()  # reports do without frames
+    assert passed and line.startswith("drawing: no frames in reports, no films: cannot draw without OpenGL (egl: ")
+
+
+@pytest.mark.usefixtures("opengl")
+def test_doctor_says_what_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    assert doctor._drawing() == (True, f"drawing: by {render._headless_way()}")
 
 
 @pytest.mark.usefixtures("fresh_probe")

@@ -171,8 +171,9 @@ def test_summary_cards_by_hand(tmp_path: Path) -> None:
     assert "2 settings" in best.value and sure.value == "no clear difference"
     assert sure.text.startswith("No difference was found between qdos and supe (95 % interval of the probability")
     nothing = write_run(tmp_path / "n", success=[0.0])
-    best, sure, fastest, never, _ = summary_cards(read_study([nothing]))
+    best, sure, fastest, never, time = summary_cards(read_study([nothing]))
     assert (best.value, fastest.value) == ("none", "none") and "nothing to compare" in sure.text
+    assert time.text.startswith("1 member, ")
     assert never.value == "never reached the goal" and "--steps 8000" in never.text
 
 
@@ -189,6 +190,14 @@ def test_summary_cards_by_hand(tmp_path: Path) -> None:
 def test_advice_by_hand(success: list[float], verdict: str, says: str) -> None:
     found = advise(np.array([100.0, 200, 300, 400]), np.array(success), "antmaze-medium-task1")
     assert found.verdict == verdict and says in found.text
+
+
+def test_a_smoke_run_is_not_advised_to_go_on(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "s", success=[0.0])
+    text = (run / "summary.json").read_text()
+    (run / "summary.json").write_text(text.replace('"preset": "paper"', '"preset": "smoke"'))
+    (card,) = [card for card in summary_cards(read_study([run])) if card.title == "How it went"]
+    assert card.value == "a smoke run" and "without --preset smoke" in card.text and "--steps" not in card.text
 
 
 def test_a_reader_is_warned(tmp_path: Path) -> None:
