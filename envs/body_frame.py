@@ -12,11 +12,13 @@ import jax.numpy as jnp
 class BodyFrame:
     """Describe which numbers of an observation move and turn with the body, by the index of the first of each.
 
-    A pose is (x, y, cos yaw, sin yaw); without a heading in the observation the yaw is 0 and nothing is turned.
+    A pose is (x, y, cos yaw, sin yaw). Where the observation has no heading, the direction in which the body moves may
+    stand for it; without either the yaw is 0 and nothing is turned.
 
     Attributes:
         place: x and y of the body.
         heading: the body's quaternion (w, x, y, z), or None where the observation has none.
+        course: x and y parts of the velocity whose direction is taken for the heading, or None.
         points: x and y of other things in the plane.
         quaternions: of other things.
         vectors: x and y parts of velocities in the world's frame.
@@ -24,6 +26,7 @@ class BodyFrame:
 
     place: int = 0
     heading: int | None = None
+    course: int | None = None
     points: tuple[int, ...] = ()
     quaternions: tuple[int, ...] = ()
     vectors: tuple[int, ...] = ()
@@ -31,12 +34,7 @@ class BodyFrame:
     def pose(self, observation: jax.Array) -> jax.Array:
         """Return (x, y, cos yaw, sin yaw)[..., 4] of ``observation[..., obs]``, in its own units."""
         place = _pair(observation, self.place)
-        if self.heading is None:
-            facing = jnp.broadcast_to(jnp.array([1.0, 0.0]), place.shape)
-        else:
-            yaw = _yaw(_quaternion(observation, self.heading))
-            facing = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
-        return jnp.concatenate([place, facing], axis=-1)
+        return jnp.concatenate([place, self._facing(observation)], axis=-1)
 
     def see(self, observation: jax.Array, pose: jax.Array) -> jax.Array:
         """Return float[..., obs + 2 points], the observation in the frame of ``pose[..., 4]``.
@@ -55,6 +53,17 @@ class BodyFrame:
                 seen = _replace(seen, index, _turned_quaternion(_quaternion(observation, index), facing))
         gaps = [_pair(seen, index) - _pair(seen, self.place) for index in self.points]
         return jnp.concatenate([seen, *gaps], axis=-1)
+
+    def _facing(self, observation: jax.Array) -> jax.Array:
+        """Return (cos yaw, sin yaw)[..., 2]."""
+        if self.heading is not None:
+            yaw = _yaw(_quaternion(observation, self.heading))
+        elif self.course is not None:
+            x, y = jnp.moveaxis(_pair(observation, self.course), -1, 0)
+            yaw = jnp.arctan2(y, x)
+        else:
+            yaw = jnp.zeros(observation.shape[:-1])
+        return jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
 
 
 def _pair(observation: jax.Array, index: int) -> jax.Array:

@@ -86,8 +86,8 @@ class HumanoidMaze(BodyTask):
     """
 
     body = HUMANOID
-    # Its heading is not observed, so that nothing can be turned.
-    body_frame = BodyFrame()
+    # Its heading is not observed; while it walks, it faces where its centre of mass and its root move.
+    body_frame = BodyFrame(course=39, vectors=(39, 42))
 
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         super().__init__(spec, physics)

@@ -16,7 +16,7 @@ from envs.mazes.maze_task import MazeTask
 from envs.mazes.soccer import BALL_QPOS
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.rising import Recovery
-from qdos_brax.collection.experts.steering import approach, dribble_direction, maze_direction
+from qdos_brax.collection.experts.steering import approach, dribble_direction
 from qdos_brax.collection.experts.views import random_direction
 from qdos_brax.collection.planning import Planner
 from qdos_brax.collection.profiles import profile_of
@@ -45,7 +45,6 @@ class Collector:
         UserError: no expert is shipped for the body.
     """
 
-    version = 5
     chunk_steps = CHUNK_STEPS
 
     def __init__(
@@ -56,10 +55,12 @@ class Collector:
         recovery: Recovery | None = None,
     ) -> None:
         self.env, self.recipe, profile = env, recipe, profile_of(env)
+        self.version = profile.version
         self.expert, self.recovery = expert or profile.expert(), recovery or profile.recovery()
         self._dribbler = self.expert if isinstance(self.expert, policies.DribblingExpert) else None
         self._walker = policies.walker_of(self.expert)
         self.planner = Planner(env, recipe, self._dribbler is not None)
+        self._steer = profile.steering(self.planner.navigator)
 
     @property
     def expert_id(self) -> str:
@@ -209,8 +210,7 @@ class Collector:
         navigator, pipeline = self.planner.navigator, state.pipeline
         body, target_object = self.planner.positions(state)
         target = jnp.where(state.returning, state.origin_xy, state.goal_xy)
-        away = maze_direction(navigator, body, state.escape_xy)
-        on_foot = maze_direction(navigator, body, target)
+        away, on_foot = self._steer(pipeline.qpos, state.escape_xy), self._steer(pipeline.qpos, target)
         if self._dribbler is not None:
             to_ball, in_sight = approach(navigator, body, target_object)
             on_foot = jnp.where(state.has_ball, to_ball, on_foot)

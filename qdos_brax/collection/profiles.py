@@ -9,13 +9,12 @@ from functools import partial
 from envs.mazes.maze_task import MazeTask
 from qdos_brax.collection.experts import policies
 from qdos_brax.collection.experts.rising import NoRecovery, Recovery, humanoid_rising
+from qdos_brax.collection.experts.steering import CellSteering, Navigator, Steering
+from qdos_brax.collection.experts.turning import CurvedSteering
 from qdos_brax.errors import UserError
 
-MAZE_TURN = 1.5
-"""Largest angle between a humanoid's facing direction and its command, rad.
-
-It gets up facing anywhere and has to turn within a corridor: with 1.0 it falls twice as often, at walls.
-"""
+MAZE_TURN = 1.2
+"""Largest angle between a humanoid's facing direction and its command, rad: it turns in 0.4 m, and falls more often."""
 
 
 @dataclass(frozen=True)
@@ -25,14 +24,18 @@ class CollectionProfile:
     Attributes:
         expert: returns the shipped expert; a dribbler for a body with a ball.
         recovery: returns what gets the body up after a fall.
+        steering: makes what leads it through a maze.
         heavy_noise: standard deviation of the action noise of noisy episodes and of ``explore``.
         stitch_steps: control steps of an episode of ``stitch``.
+        version: of the rows, raised when the same arguments give others; part of the default sets' names.
     """
 
     expert: Callable[[], policies.Expert]
     recovery: Callable[[], Recovery]
+    steering: Callable[[Navigator], Steering]
     heavy_noise: float
     stitch_steps: int
+    version: int = 5
 
 
 def profile_of(env: MazeTask) -> CollectionProfile:
@@ -49,13 +52,15 @@ def profile_of(env: MazeTask) -> CollectionProfile:
     return PROFILES[env.spec.family]
 
 
-ANT = CollectionProfile(policies.ant_walker, NoRecovery, heavy_noise=1.0, stitch_steps=200)
+ANT = CollectionProfile(policies.ant_walker, NoRecovery, CellSteering, heavy_noise=1.0, stitch_steps=200)
 
 HUMANOID = CollectionProfile(
     partial(policies.humanoid_walker, max_turn=MAZE_TURN),
     humanoid_rising,
+    CurvedSteering,
     heavy_noise=0.4,
     stitch_steps=400,
+    version=6,
 )
 
 PROFILES = {"antmaze": ANT, "antsoccer": replace(ANT, expert=policies.ant_dribbler), "humanoidmaze": HUMANOID}

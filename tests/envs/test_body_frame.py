@@ -63,6 +63,27 @@ def test_a_pose_and_a_place_by_hand():
 
 
 @pytest.mark.quick
+def test_a_humanoid_is_seen_from_where_it_moves():
+    """Its state's turn about the vertical changes nothing of what is seen; its course is the x axis."""
+    env = envs.make("humanoidmaze-medium", physics="mujoco")
+    frame, rng = env.body_frame, np.random.default_rng(1)
+    qpos = np.concatenate([[0.5, 0.2, 1.3, 1.0, 0.1, 0.0, 0.2], rng.uniform(-0.1, 0.1, 21)])
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    qvel = rng.normal(size=27)
+
+    def see(angle, shift):
+        state = env.reset_to(*moved(qpos, qvel, [(0, 0)], angle, shift))
+        return np.asarray(frame.see(state.obs, frame.pose(state.obs))), np.asarray(state.obs)
+
+    (here, observed), (there, _) = see(0.0, np.zeros(2)), see(2.1, np.array([0.4, -0.3]))
+    np.testing.assert_allclose(here, there, atol=2e-4)
+    np.testing.assert_allclose(here[[0, 1, 40]], 0.0, atol=1e-6)
+    np.testing.assert_allclose(here[39], np.linalg.norm(observed[39:41]), rtol=1e-5)
+    others = np.setdiff1d(np.arange(69), [0, 1, 39, 40, 42, 43])
+    np.testing.assert_array_equal(here[others], observed[others])
+
+
+@pytest.mark.quick
 def test_without_a_heading_places_are_relative_and_nothing_turns():
     frame = BodyFrame(vectors=(2,))
     pose = frame.pose(jnp.array([4.0, 5.0, 1.0, 2.0]))

@@ -37,6 +37,7 @@ _CALM = 0.3  # mean speed of the root (m/s, rad/s) and the joints (rad/s) below 
 _SHORTEST_REST, _LONGEST_REST = 20, 60  # control steps
 _ON_BACK = 0.9  # height of the tip of the body's forward axis, a unit vector
 _BALANCING = 40  # control steps after which a body that rises has to be on its feet
+_SOONEST, _TALL, _STRAIGHT = 30, 1.2, 0.97  # steps, height (m) and cosine from which on it is
 _DOWN, _TILTED = 0.6, 0.3  # height of the torso (m), or cosine to the vertical, below which walking is given up
 
 # Ankles and arms are light: as stiff as the other joints they would swing at 40 control steps per second.
@@ -145,13 +146,15 @@ def next_stage(motions: Motions, memory: jax.Array, qpos: jax.Array, qvel: jax.A
     rested = calm | (steps >= _LONGEST_REST)
     on_back = forward_axis(qpos)[2] > _ON_BACK
     is_down = (qpos[2] < _DOWN) | (uprightness(qpos) < _TILTED)
+    # The riser walks on where it faces, the walker can turn off a wall: it takes over as soon as it can.
+    is_steady = (steps >= _SOONEST) & (qpos[2] > _TALL) & (uprightness(qpos) > _STRAIGHT)
     then = jnp.stack(
         [
             jnp.where(is_down, LIES, WALKS),
             jnp.where(rested, jnp.where(on_back, CROUCHES, TURNS), LIES),
             jnp.where(steps >= length(motions.turn), LIES, TURNS),
             jnp.where(steps >= length(motions.crouch) + HOLD, RISES, CROUCHES),
-            jnp.where(steps >= _BALANCING, jnp.where(is_down, LIES, WALKS), RISES),
+            jnp.where(is_steady, WALKS, jnp.where(steps < _BALANCING, RISES, jnp.where(is_down, LIES, WALKS))),
         ]
     )[doing]
     return jnp.stack([then, jnp.where(then == doing, steps + 1, 0)]).astype(jnp.int32)

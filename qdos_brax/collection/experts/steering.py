@@ -6,6 +6,8 @@ tables, so that following a shortest path costs one look-up per step.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,6 +62,29 @@ class Navigator:
         gap = UNIT / 2 - jnp.asarray(_SIDES) @ (xy - self.centre(cell))
         nearness = jnp.where(self._wall_beside[cell], jnp.clip(1 - gap / _BERTH, 0.0, 1.0), 0.0)
         return -nearness @ jnp.asarray(_SIDES, jnp.float32)
+
+
+class Steering(Protocol):
+    """Define what leads a walking body to places in a maze."""
+
+    def __call__(self, qpos: jax.Array, goal_xy: jax.Array) -> jax.Array:
+        """Return the unit vector[2] in which a body at ``qpos[nq]`` is to walk on its way to ``goal_xy[2]``."""
+        ...
+
+
+class CellSteering:
+    """Walk a body that can turn anywhere from cell to cell.
+
+    Args:
+        navigator: the maze.
+    """
+
+    def __init__(self, navigator: Navigator) -> None:
+        self._navigator = navigator
+
+    def __call__(self, qpos: jax.Array, goal_xy: jax.Array) -> jax.Array:
+        """Return the unit vector[2] of ``maze_direction``."""
+        return maze_direction(self._navigator, qpos[:2], goal_xy)
 
 
 def maze_direction(maze: Navigator, xy: jax.Array, goal_xy: jax.Array) -> jax.Array:

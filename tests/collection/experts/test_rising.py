@@ -48,9 +48,12 @@ UPRIGHT, ON_BACK, ON_FRONT = (1.0, 0, 0, 0), (HALF, 0, -HALF, 0), (HALF, 0, HALF
         (TURNS, 4, pose(0.1, ON_FRONT), 1.0, [LIES, 0]),  # 0.1 s
         (CROUCHES, 27, pose(0.5, UPRIGHT), 1.0, [CROUCHES, 28]),
         (CROUCHES, 28, pose(0.5, UPRIGHT), 1.0, [RISES, 0]),  # 0.3 s, held for 16 steps
+        (RISES, 29, pose(1.25, UPRIGHT), 1.0, [RISES, 30]),
+        (RISES, 30, pose(1.25, UPRIGHT), 1.0, [WALKS, 0]),
         (RISES, 39, pose(0.5, UPRIGHT), 1.0, [RISES, 40]),
+        (RISES, 39, pose(1.25, ON_BACK), 1.0, [RISES, 40]),
         (RISES, 40, pose(0.5, UPRIGHT), 1.0, [LIES, 0]),
-        (RISES, 40, pose(1.2, UPRIGHT), 1.0, [WALKS, 0]),
+        (RISES, 40, pose(1.15, UPRIGHT), 1.0, [WALKS, 0]),
     ],
 )
 def test_stages_by_hand(doing: int, steps: int, qpos: jax.Array, speed: float, expected: list[int]) -> None:
