@@ -150,6 +150,7 @@ def check_method(config: Config) -> None:
 _AS_BEFORE = {
     ("skills", "view"): "world",
     ("skills", "schedule"): "constant",
+    ("skills", "least_std"): 0.0,
     ("skills", "mi_encoder"): "segment",
     ("skills", "mi_latent"): "box",
     ("skills", "effective_share"): 0.5,

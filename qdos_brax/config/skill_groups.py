@@ -81,6 +81,12 @@ class SkillsConfig:
     encoder_hidden: int = count(256, "width of the bidirectional GRU (the posterior)")
     encoder_layers: int = count(2, "layers of the bidirectional GRU")
     decoder_hidden: tuple[int, ...] = widths((256, 256), "hidden layers of the low-level policy")
+    least_std: float = number(
+        0.0,
+        "least standard deviation of the low-level policy in the likelihood: actions without noise (at their limit, or "
+        "of a part of the data) would count by its inverse square and leave nothing to the others; 0 sets none",
+        scan=False,
+    )
     prior_hidden: tuple[int, ...] = widths((256, 256), "hidden layers of the state prior")
     batch_size: int = count(256, "segments per gradient step")
     learning_rate: Scannable = rate(3e-4)

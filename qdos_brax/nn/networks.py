@@ -5,6 +5,7 @@ Every module takes arrays with any leading axes and acts on the last one, unless
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import flax.linen as nn
@@ -66,17 +67,20 @@ class DiagonalGaussian(nn.Module):
         hidden: hidden widths.
         dim: dimension of the Gaussian.
         layer_norm: LayerNorm before each activation.
+        least_std: least standard deviation, where it is above that of all Gaussians here.
     """
 
     hidden: Sequence[int]
     dim: int
     layer_norm: bool = False
+    least_std: float = 0.0
 
     @nn.compact
     def __call__(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Maps [..., in] to (mean[..., dim], log standard deviation[..., dim])."""
         mean, log_std = jnp.split(MLP((*self.hidden, 2 * self.dim), self.layer_norm)(x), 2, axis=-1)
-        return mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
+        least = max(LOG_STD_MIN, math.log(self.least_std)) if self.least_std else LOG_STD_MIN
+        return mean, jnp.clip(log_std, least, LOG_STD_MAX)
 
 
 class SegmentEncoder(nn.Module):

@@ -55,7 +55,7 @@ class SkillModel:
         self.context_size = self.seen_dim + config.latent_dim
         self._encoder = SegmentEncoder(config.encoder_hidden, config.encoder_layers, config.latent_dim)
         self._prior = DiagonalGaussian(config.prior_hidden, config.latent_dim)
-        self._decoder = DiagonalGaussian(config.decoder_hidden, action_dim)
+        self._decoder = DiagonalGaussian(config.decoder_hidden, action_dim, least_std=config.least_std)
         self._correction = MLP((*config.decoder_hidden, action_dim))
 
     def init(self, key: jax.Array, view: Mapping[str, Params] = MappingProxyType({})) -> dict[str, Params]:
