@@ -32,6 +32,7 @@ from qdos_brax.data.requirements import remarks
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.methods.build import bind_phases, build_context, build_phases, check_skills, plan_members
+from qdos_brax.population.ahead import compile_beside
 from qdos_brax.population.members import Population
 from qdos_brax.runs import comparison, observers, shares, signals
 from qdos_brax.runs.checkpoint import Artifacts
@@ -261,6 +262,8 @@ def _train(
         write_text(folder.config, configs.to_yaml(config))
     hyper = configs.population_hyper(config, members)
     bind_phases(phases, Population(hyper, found.per_program, found.devices, found.parked), context.data)
+    if not folder.metrics.exists():  # a run that goes on may need the last phase's programs alone
+        compile_beside(phases, len(members))
     summary, artifacts = run_phases(
         phases,
         folder,

@@ -106,6 +106,11 @@ class OnlinePhase(MemberPhase):
         super().bind(population, data)
         self._evaluate = population.program(self._play_episodes, carries=True)
 
+    def compile(self, state: Any, constants: Any) -> None:
+        """Compile the programs of chunks, that of the evaluation included."""
+        super().compile(state, constants)
+        self._evaluate.compile(state, constants, self.hyper, self.data)
+
     def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[Any, Any]:
         """Return the first state, with the high level as it was learned offline if it was, and the constants."""
         state, constants = super().init(key, artifacts)

@@ -18,6 +18,39 @@ from jax.sharding import NamedSharding, PartitionSpec, SingleDeviceSharding
 _AXIS = "members"
 
 
+class Program:
+    """Run a compiled function of one member for all members of a population.
+
+    Args:
+        compiled: the jitted function of a group of members.
+        call: calls it for all members.
+        spread: how the members' own arguments lie on the devices when it is called; None where they are.
+        slots: members of a group; 0 for all.
+    """
+
+    def __init__(
+        self, compiled: Any, call: Callable[..., Any], spread: NamedSharding | None = None, slots: int = 0
+    ) -> None:
+        self._compiled, self._call, self._spread, self._slots = compiled, call, spread, slots
+
+    def __call__(self, *args: Any) -> Any:
+        """Return the function's results for trees with a leading member axis, and what the members share."""
+        return self._call(*args)
+
+    def compile(self, *args: Any) -> jax.stages.Compiled:
+        """Return the program for arguments of the shapes of ``args``, compiled; a call finds it then.
+
+        The arguments may be arrays or ``jax.ShapeDtypeStruct``; what the members share lies where it will be.
+        """
+        own = args[:-1] if self._spread is None else jax.tree.map(self._spread_shape, args[:-1])
+        return self._compiled.lower(*own, args[-1]).compile()
+
+    def _spread_shape(self, leaf: Any) -> jax.ShapeDtypeStruct:
+        shape = (self._slots or leaf.shape[0], *leaf.shape[1:])
+        weak = getattr(leaf, "weak_type", False)
+        return jax.ShapeDtypeStruct(shape, leaf.dtype, sharding=self._spread, weak_type=weak)
+
+
 class Population:
     """Run what is written for one member for all members of a run.
 
@@ -54,7 +87,7 @@ class Population:
         """Return what all members read (the data set), on every device."""
         return tree if len(self.devices) == 1 else jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec()))
 
-    def program(self, function: Callable[..., Any], carries: bool = False) -> Callable[..., Any]:
+    def program(self, function: Callable[..., Any], carries: bool = False) -> Program:
         """Return ``function(*member_trees, shared)`` of one member, compiled for trees with a leading member axis.
 
         Args:
@@ -63,10 +96,12 @@ class Population:
         """
         compiled = jax.jit(self._over_devices(function), donate_argnums=0 if carries else ())
         if self._takes_turns:
-            return partial(self._in_turn, compiled, carries)
+            return Program(compiled, partial(self._in_turn, compiled, carries), self._spread, self._slots)
         if len(self.devices) == 1:
-            return compiled
-        return lambda *args: compiled(*jax.device_put(args[:-1], self._spread), args[-1])
+            return Program(compiled, compiled)
+        return Program(
+            compiled, lambda *args: compiled(*jax.device_put(args[:-1], self._spread), args[-1]), self._spread
+        )
 
     def _over_devices(self, function: Callable[..., Any]) -> Callable[..., Any]:
         group = over_members(function, self.per_program)

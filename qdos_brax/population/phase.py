@@ -54,6 +54,10 @@ class MemberPhase:
         state, info = self._chunk(state, constants, self.hyper, self.data)
         return state, self.metrics(state, jax.tree.map(np.asarray, info))
 
+    def compile(self, state: Any, constants: Any) -> None:
+        """Compile the programs of chunks for arguments of these shapes."""
+        self._chunk.compile(state, constants, self.hyper, self.data)
+
     def working_bytes(self, state: Any, constants: Any) -> int:
         """Return the bytes that a chunk needs beside its arguments, which may be shapes alone."""
         return working_bytes(self._chunk, state, constants, self.hyper, self.data)

@@ -47,6 +47,9 @@ class GraphPhase(MemberPhase):
         found = {"update": np.ones(self._members), "cost_to_go": np.full(self._members, costs.mean())}
         return jnp.asarray(np.tile(-costs, (self._members, 1))), found
 
+    def compile(self, state: Any, constants: Any) -> None:
+        """Compile nothing: the search is the host's."""
+
     def working_bytes(self, state: Any, constants: Any) -> int:
         """Return 0: the search is the host's."""
         return 0

@@ -129,7 +129,7 @@ def test_memory_is_near_what_the_compiler_says() -> None:
 
     state, shared = jnp.zeros((1, 256, 512)), jnp.zeros((512, 512))
     program = Population({"rate": np.zeros(1)}).program(step, carries=True)
-    compiled = program.lower(state, shared).compile().memory_analysis()
+    compiled = program.compile(state, shared).memory_analysis()
     needed = memory.working_bytes(program, state, shared)
     assert 0.3 < needed / compiled.temp_size_in_bytes < 4
 
