@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -40,14 +41,12 @@ def compile_beside(phases: Sequence[Compiled], members: int) -> threading.Thread
 
 
 def _compile(phases: Sequence[Compiled], members: int) -> None:
-    key = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), members))
-    artifacts: dict[str, Any] = {}
-    try:
+    with contextlib.suppress(Exception):  # whatever it is, the phase meets it where it can be told
+        key = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), members))
+        artifacts: dict[str, Any] = {}
         for index, phase in enumerate(phases):
             state, constants = jax.eval_shape(phase.init, key, artifacts)
             if index:
                 phase.compile(state, constants)
             artifacts = jax.eval_shape(phase.finish, state, artifacts)
             artifacts.pop(health.KEY, None)  # a copy is made of it, and shapes cannot be copied
-    except Exception:
-        return
