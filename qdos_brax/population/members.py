@@ -26,12 +26,15 @@ class Program:
         call: calls it for all members.
         spread: how the members' own arguments lie on the devices when it is called; None where they are.
         slots: members of a group; 0 for all.
+
+    Attributes:
+        compiled: as given.
     """
 
     def __init__(
         self, compiled: Any, call: Callable[..., Any], spread: NamedSharding | None = None, slots: int = 0
     ) -> None:
-        self._compiled, self._call, self._spread, self._slots = compiled, call, spread, slots
+        self.compiled, self._call, self._spread, self._slots = compiled, call, spread, slots
 
     def __call__(self, *args: Any) -> Any:
         """Return the function's results for trees with a leading member axis, and what the members share."""
@@ -43,7 +46,7 @@ class Program:
         The arguments may be arrays or ``jax.ShapeDtypeStruct``; what the members share lies where it will be.
         """
         own = args[:-1] if self._spread is None else jax.tree.map(self._spread_shape, args[:-1])
-        return self._compiled.lower(*own, args[-1]).compile()
+        return self.compiled.lower(*own, args[-1]).compile()
 
     def _spread_shape(self, leaf: Any) -> jax.ShapeDtypeStruct:
         shape = (self._slots or leaf.shape[0], *leaf.shape[1:])

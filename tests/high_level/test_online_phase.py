@@ -118,7 +118,7 @@ def test_success_in_training_is_the_share_of_the_episodes_that_ended(trained):
 
 def test_a_phase_is_traced_once(trained):
     phase, _, _, _, _ = trained
-    assert phase._chunk._cache_size() == 1
+    assert phase._chunk.compiled._cache_size() == 1
 
 
 def test_the_batch_is_half_offline_and_half_online(trained):

@@ -187,8 +187,8 @@ def test_chunks_are_not_traced_again_and_members_differ_by_seed_and_value():
     np.testing.assert_array_equal(first[0], first[1])  # seed 0 with either alpha starts the same
     assert not np.array_equal(first[0], first[2])
     state, _ = phase.chunk(state, constants)
-    traced = phase._chunk._cache_size()
+    traced = phase._chunk.compiled._cache_size()
     state, _ = phase.chunk(state, constants)
-    assert phase._chunk._cache_size() == traced == 1
+    assert phase._chunk.compiled._cache_size() == traced == 1
     last = leaf(state)
     assert not np.array_equal(last[0], last[1]) and not np.array_equal(last[0], last[2])
