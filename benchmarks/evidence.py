@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import skills
+from table import write_rows
 
 import envs
 from qdos_brax import config as configs
@@ -123,7 +124,7 @@ def run_program(program: Program, asked: Config, env: Any, dataset: Dataset, arg
     with folder.held():
         write_text(folder.config, text)
         rows = measure(config, env, dataset, train(config, folder, env, dataset), args)
-        skills.write_rows(done, rows)
+        write_rows(done, rows)
     return rows
 
 
@@ -153,7 +154,7 @@ def main() -> None:
     for program in programs(args.view.split(","), temperature, args.alpha or config.skills.alpha, args.outcome_alpha):
         rows += run_program(program, config, env, dataset, args)
     args.out.mkdir(parents=True, exist_ok=True)
-    skills.write_rows(args.out / "evidence.csv", rows)
+    write_rows(args.out / "evidence.csv", rows)
     text = table(rows)
     write_text(args.out / "evidence.txt", text)
     print(text, end="")

@@ -9,13 +9,13 @@ steps of walking, the share of steps on the floor after 8 s, and how far from a 
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from table import write_rows
 
 import envs
 from envs.mazes.maze import Maze
@@ -122,11 +122,7 @@ def main() -> None:
             rows.append(measure(env, noise, goal, args.episodes, args.seed))
             print("  ".join(f"{name} {value}" for name, value in rows[-1].items()), flush=True)
     if args.out:
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        with args.out.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, names)
-            writer.writeheader()
-            writer.writerows(rows)
+        write_rows(args.out, rows)
 
 
 if __name__ == "__main__":

@@ -32,9 +32,9 @@ from qdos_brax.data.requirements import remarks
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.methods.build import bind_phases, build_context, build_phases, check_skills, plan_members
-from qdos_brax.population.ahead import compile_beside
 from qdos_brax.population.members import Population
 from qdos_brax.runs import comparison, observers, shares, signals
+from qdos_brax.runs.beside import compile_beside
 from qdos_brax.runs.checkpoint import Artifacts
 from qdos_brax.runs.fingerprints import sha256_once
 from qdos_brax.runs.folder import RunFolder, new_path

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
+import evidence
 import pytest
 
 from qdos_brax import config as configs
 
 
-@pytest.fixture(scope="module")
-def evidence() -> Any:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
-        return importlib.import_module("evidence")
-
-
-def test_every_arm_is_there_once_for_every_seed(evidence: Any) -> None:
+def test_every_arm_is_there_once_for_every_seed() -> None:
     asked = configs.load_config("antmaze-large", "cpu", {"seed": "20,21"})
     found = [
         evidence.arm_of(config, member)
@@ -37,7 +29,7 @@ def test_every_arm_is_there_once_for_every_seed(evidence: Any) -> None:
     assert len(found) == len(expected) and {tuple(arm.values()) for arm in found} == expected
 
 
-def test_an_arms_cell_is_the_mean_over_seeds_with_its_interval(evidence: Any) -> None:
+def test_an_arms_cell_is_the_mean_over_seeds_with_its_interval() -> None:
     """Of two seeds the bootstrap draws (a, a), (a, b), (b, a), (b, b): the interval of 95 % reaches from a to b."""
     rows = [
         {"view": "start", "weights": weights, "information": "off", "seed": seed, "spread": value, "seconds": 9.0}
@@ -50,9 +42,7 @@ def test_an_arms_cell_is_the_mean_over_seeds_with_its_interval(evidence: Any) ->
     assert off.split() == ["start", "off", "off", "2", "0.500", "[0.500,", "0.500]"]
 
 
-def test_a_measured_program_is_read_and_not_trained_again(
-    evidence: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_measured_program_is_read_and_not_trained_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     args = Namespace(out=tmp_path, draws=2, states=3, episodes=0)
     asked = configs.load_config("antmaze-large", "cpu", {"seed": "20,21"})
     program = evidence.programs(["start"], 1.0, 0.3, 3.0)[0]

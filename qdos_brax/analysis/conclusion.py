@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import json
 import sys
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +14,7 @@ from qdos_brax.config.methods import METHODS
 from qdos_brax.data import formats
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.errors import UserError
+from qdos_brax.runs.beside import start_beside
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import module_command, train_command
 
@@ -27,16 +26,12 @@ _AT_THE_END = ("qdos_brax.report.write", "qdos_brax.analysis.inside")
 
 def load_beside() -> None:
     """Load Matplotlib, SciPy's statistics and scikit-learn on a thread, while the run trains: 1.5 s for its end."""
-    # No daemon: a process that ends early waits for it, since a thread that is killed within a C++ library aborts.
-    threading.Thread(target=_load).start()
 
-
-def _load() -> None:
-    # A process that is about to end allows no executors any more: no traceback after its one line. Who needs the
-    # modules imports them, and is told what is wrong.
-    with contextlib.suppress(Exception):
+    def load() -> None:
         for name in _AT_THE_END:
             importlib.import_module(name)
+
+    start_beside(load, "load")
 
 
 def conclude(folder: RunFolder, summary: Mapping[str, Any], finished: Callable[[], tuple[TrainedRun, Dataset]]) -> None:

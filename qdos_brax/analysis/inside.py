@@ -73,13 +73,14 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
     arrays: Arrays = {"members": np.asarray(members), **_place(trained.env), **_truth(trained, sample)}
     latents, runner = _LatentView(trained, sample), EpisodeRunner(trained)
     with ThreadPoolExecutor(1) as beside:  # t-SNE on one core while episodes are played and drawn on another
-        places = {}
-        for member in members:
-            view, episode = latents.of(member), play_episode(trained, runner, member)
+        places, episodes = {}, {}
+        for member in members:  # all are played first, so that t-SNE has the most to do beside the drawing
+            view, episodes[member] = latents.of(member), play_episode(trained, runner, member)
             if "latent" in view:
-                places[member] = beside.submit(embedded, view["latent"], episode.latents)
-            measured = measure_episode(trained.env, episode, trained.config.skills.horizon)
-            arrays |= _of_member(member, _weights(trained, member, sample) | view | measured)
+                places[member] = beside.submit(embedded, view["latent"], episodes[member].latents)
+            arrays |= _of_member(member, _weights(trained, member, sample) | view)
+        for member, episode in episodes.items():
+            arrays |= _of_member(member, measure_episode(trained.env, episode, trained.config.skills.horizon))
         for member, embedding in places.items():
             arrays |= _of_member(member, embedding.result())
     write_arrays(out, arrays)

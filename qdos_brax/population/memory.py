@@ -11,30 +11,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 
-from qdos_brax.population import health
+from qdos_brax.population.shapes import ShapedPhase, shapes_of
 
 _ROOM = 0.9  # share of a device's memory that is planned with; the rest is for fragments and for what XLA adds
 _GB = 1e9
-
-
-class Sized(Protocol):
-    """Define a phase whose memory can be told before it runs."""
-
-    def init(self, key: jax.Array, artifacts: dict[str, Any]) -> tuple[Any, Any]:
-        """Return the state before the first chunk, and the constants of all chunks."""
-        ...
-
-    def working_bytes(self, state: Any, constants: Any) -> int:
-        """Return what a chunk needs beside its arguments, which may be shapes alone."""
-        ...
-
-    def finish(self, state: Any, artifacts: dict[str, Any]) -> dict[str, Any]:
-        """Return what the next phases need."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,22 +53,17 @@ class MemoryPlan:
     line: str
 
 
-def estimate(phases: Sequence[Sized], shared: int) -> MemoryEstimate:
+def estimate(phases: Sequence[ShapedPhase], shared: int) -> MemoryEstimate:
     """Return the largest need of the phases of a population of one; nothing is compiled and nothing runs.
 
     Args:
         phases: in order; they are of no use afterwards, since what they hold are shapes.
         shared: bytes of the data set on a device.
     """
-    key = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 1))
-    artifacts: dict[str, Any] = {}
     kept = working = 0
-    for phase in phases:
-        state, constants = jax.eval_shape(phase.init, key, artifacts)
+    for phase, state, constants, artifacts in shapes_of(phases, 1):
         kept = max(kept, num_bytes(state) + num_bytes(artifacts))
         working = max(working, phase.working_bytes(state, constants))
-        artifacts = jax.eval_shape(phase.finish, state, artifacts)
-        artifacts.pop(health.KEY, None)  # a copy is made of it, and shapes cannot be copied
     return MemoryEstimate(shared, kept, working)
 
 

@@ -134,6 +134,8 @@ def _draw_scan(axis: Axes, scan: Scan) -> None:
 def save_figure(figure: Figure, out: Path) -> None:
     """Write a figure to a file, as a whole or not at all, and free its memory."""
     try:
+        figure.draw_without_rendering()  # lays it out once, where savefig would twice
+        figure.set_layout_engine(None)
         with replacing(out) as partial:
             figure.savefig(partial, dpi=120)
     finally:

@@ -18,8 +18,8 @@ from qdos_brax.high_level.warm_up import RandomWarmUp
 from qdos_brax.labels.bonus import NoBonus
 from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward
-from qdos_brax.population.ahead import compile_beside
 from qdos_brax.population.members import Population
+from qdos_brax.runs.beside import compile_beside
 from qdos_brax.runs.checkpoint import as_device_arrays
 from qdos_brax.skills.information import PhysicsRollout
 from qdos_brax.skills.information_terms import SegmentTerm

@@ -1,11 +1,10 @@
-"""The arithmetic of ``benchmarks/skills.py``: how much of a latent is read off what happened."""
+"""The arithmetic of ``benchmarks/regression.py``: how much of a latent is read off what happened."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from benchmarks.skills import least_squares, r2, ridge
+from regression import least_squares, r2, ridge
 
 
 def test_ridge_is_least_squares_where_nothing_can_be_gained() -> None:
