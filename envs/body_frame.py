@@ -3,9 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
+
+
+class Frame(Protocol):
+    """Define how a task's body sees its observations from a pose: leading axes are free."""
+
+    @property
+    def pose_size(self) -> int:
+        """Return the numbers of a pose."""
+        ...
+
+    def size(self, observation_size: int) -> int:
+        """Return the numbers of ``see``."""
+        ...
+
+    def pose(self, observation: jax.Array) -> jax.Array:
+        """Return the pose[..., pose_size] of the body in ``observation[..., obs]``, in its own units."""
+        ...
+
+    def see(self, observation: jax.Array, pose: jax.Array) -> jax.Array:
+        """Return what is seen of ``observation[..., obs]`` from ``pose[..., pose_size]``."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -30,6 +52,12 @@ class BodyFrame:
     points: tuple[int, ...] = ()
     quaternions: tuple[int, ...] = ()
     vectors: tuple[int, ...] = ()
+
+    pose_size: ClassVar[int] = 4
+
+    def size(self, observation_size: int) -> int:
+        """Return the numbers of ``see``."""
+        return observation_size + 2 * len(self.points)
 
     def pose(self, observation: jax.Array) -> jax.Array:
         """Return (x, y, cos yaw, sin yaw)[..., 4] of ``observation[..., obs]``, in its own units."""

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.body_frame import BodyFrame
+from envs.body_frame import Frame
 from envs.brax_base import Env, State
 from envs.families import TaskSpec
 from envs.physics.base import Engine, PipelineState
@@ -105,7 +105,7 @@ class Task(Env, ABC):
         distance_margin: change of ``distance_left`` that counts as progress or as a setback.
         jump: distance that the first two numbers of an observation, a position then, never move in one control step;
             None where they are no position. Readers of data files find unmarked ends of episodes by it.
-        body_frame: which numbers of an observation move and turn with the body.
+        body_frame: how the body sees its observations from where it is.
         metric_names: what ``state.metrics`` holds: "success", and "score" (the share of the task that is done) for a
             task that has parts.
         unfit: why known files of the same scene cannot be used, by their numbers per observation.
@@ -113,7 +113,7 @@ class Task(Env, ABC):
 
     distance_margin = 0.0
     jump: float | None = None
-    body_frame: BodyFrame | None = None
+    body_frame: Frame | None = None
     metric_names: tuple[str, ...] = ("success",)
     unfit: Mapping[int, str] = MappingProxyType({})
 

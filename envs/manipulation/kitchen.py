@@ -11,6 +11,7 @@ import numpy as np
 
 from envs.brax_base import State
 from envs.families import TaskSpec
+from envs.manipulation.hand_frame import HandFrame
 from envs.manipulation.kitchen_model import arm_config, stepped_model, whole_model
 from envs.manipulation.kitchen_rig import FRAME_SKIP, START_QPOS, SUBTASKS, KitchenRig
 from envs.physics import MujocoEngine, PipelineState
@@ -44,6 +45,7 @@ class Kitchen(Task):
     Attributes:
         subtasks: the four, by name.
         arm: the arm's limits and its sensors' errors.
+        body_frame: the kitchen as seen from the finger tips.
     """
 
     distance_margin = 0.5
@@ -56,6 +58,7 @@ class Kitchen(Task):
         model = stepped_model()
         self.arm = arm_config(model.nv)
         super().__init__(spec, MujocoEngine(model, KitchenRig(self.arm), FRAME_SKIP))
+        self.body_frame = HandFrame(model, _OBSERVED_QPOS)
         self.subtasks = _OF_VARIANT[spec.variant]
         self._places = np.array([SUBTASKS.index(name) for name in self.subtasks])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
-from envs.body_frame import BodyFrame
+from envs.body_frame import Frame
 from qdos_brax.config import Config
 from qdos_brax.config.methods import Method
 from qdos_brax.data.dataset import Dataset
@@ -19,7 +19,7 @@ class SpaceSizes(Protocol):
 
     observation_size: int
     action_size: int
-    body_frame: BodyFrame | None
+    body_frame: Frame | None
 
 
 class BuildContext(NamedTuple):

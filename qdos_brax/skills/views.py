@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from envs.body_frame import BodyFrame
+from envs.body_frame import Frame
 from qdos_brax.data.device import DeviceData, Normaliser
 from qdos_brax.data.segments import window
 from qdos_brax.errors import UserError
@@ -77,14 +77,13 @@ class StartView:
         frame: the task's.
     """
 
-    pose_size = 4
-
-    def __init__(self, frame: BodyFrame) -> None:
+    def __init__(self, frame: Frame) -> None:
         self._frame = frame
+        self.pose_size = frame.pose_size
 
     def size(self, observation_size: int) -> int:
         """Return the numbers of the frame."""
-        return observation_size + 2 * len(self._frame.points)
+        return self._frame.size(observation_size)
 
     def fit(self, windows: jax.Array, normaliser: Normaliser) -> dict[str, Any]:
         """Return mean and scale of observations ("world") and of what is seen of them ("seen")."""
@@ -96,7 +95,7 @@ class StartView:
         return {"world": world, "seen": {"mean": jnp.mean(seen, axis=(0, 1)), "scale": scale}}
 
     def pose(self, params: Any, observation: jax.Array) -> jax.Array:
-        """Return (x, y, cos yaw, sin yaw)."""
+        """Return the frame's pose."""
         return self._frame.pose(_raw(params, observation))
 
     def see(self, params: Any, observation: jax.Array, pose: jax.Array) -> jax.Array:
@@ -108,7 +107,9 @@ class StartView:
 class BodyView(StartView):
     """Show every observation from the body's present pose: where the skill began is forgotten."""
 
-    pose_size = 0
+    def __init__(self, frame: Frame) -> None:
+        super().__init__(frame)
+        self.pose_size = 0
 
     def pose(self, params: Any, observation: jax.Array) -> jax.Array:
         """Return an empty pose."""
@@ -131,7 +132,7 @@ def fit_view(view: View, data: DeviceData, normaliser: Normaliser, horizon: int)
     return view.fit(jax.jit(window, static_argnums=2)(data.observations, starts, horizon), normaliser)
 
 
-def make_view(name: str, frame: BodyFrame | None) -> View:
+def make_view(name: str, frame: Frame | None) -> View:
     """Return the view called "world", "start" or "body".
 
     Args:

@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from envs.manipulation.hand_frame import HAND, TIP
 from envs.manipulation.kitchen import Kitchen
 from envs.manipulation.kitchen_rig import START_QPOS
 
 JOINTS = 7  # without the fingers
-TIP = 0.255  # m along link 7's z, where the finger tips are
 
 _POSTURE = np.array([START_QPOS[0], -1.4, *START_QPOS[2:JOINTS]])  # what the arm's spare freedom tends to
 _SPARE_GAIN = 0.1
@@ -77,7 +77,7 @@ class Poses:
     def __init__(self, env: Kitchen, n: int) -> None:
         self.model = env.engine.model
         self._batch = Batch(self.model, nsim=n, nthread=min(n, 2))
-        self._hand = self.model.body("panda0_link7").id
+        self._hand = self.model.body(HAND).id
         fields = ("qpos", "qvel", "xpos", "xmat", "site_xpos", "geom_xpos", "geom_xmat", "xanchor", "xaxis")
         bound = {name: self._batch.bind(name) for name in (*fields, "qfrc_bias")}
         self.qpos, self._qvel, self._xpos, self._xmat = (bound[name] for name in fields[:4])

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from envs.manipulation.hand_frame import HANDLES
 from envs.manipulation.kitchen_rig import GOALS, SUBTASKS
 from qdos_brax.collection.scripted.kitchen_arm import HandTarget, Poses, frame
 
@@ -57,6 +58,10 @@ class Look:
     def site(self, name: str) -> np.ndarray:
         """Return float64[3], where a site is now."""
         return self.poses.sites[self.index, self.poses.model.site(name).id].copy()
+
+    def handle(self, subtask: str) -> np.ndarray:
+        """Return float64[3], where the hand moves the thing of a subtask."""
+        return self.site(HANDLES[subtask])
 
     def is_complete(self, subtask: str) -> bool:
         """Return whether a subtask was completed so far."""
@@ -128,7 +133,7 @@ def microwave(look: Look) -> Targets:
     """Open the door by its handle, along its arc; grasp anew wherever the tips slide off."""
     joint = look.poses.model.joint("microwave")
     hinge = look.poses.anchors[look.index, joint.id].copy()
-    handle, first = look.site("microhandle_site"), look.qpos(22)
+    handle, first = look.handle("microwave"), look.qpos(22)
     arm = handle - hinge
 
     def on_arc(angle: float) -> np.ndarray:
@@ -152,7 +157,7 @@ def microwave(look: Look) -> Targets:
 
 def hinge_cabinet(look: Look) -> Targets:
     """Open the right door: fingers behind its handle, from between the two handles, and a sweep."""
-    handle = look.site("hinge_site2")
+    handle = look.handle("hinge cabinet")
     door = _door_panel(look)
 
     def edge(off: float) -> np.ndarray:
@@ -170,7 +175,7 @@ def hinge_cabinet(look: Look) -> Targets:
 
 def light_switch(look: Look) -> Targets:
     """Move the switch to the left."""
-    at = look.site("light_site")
+    at = look.handle("light switch")
     on = lambda: look.qpos(17) < -0.66  # noqa: E731
     yield from move(look, beside(at, 0.10, -0.10, 0.0), within=0.02, steps=40)
     yield from move(look, beside(at, 0.07, 0.005, 0.0), within=0.012, steps=15)
@@ -180,7 +185,7 @@ def light_switch(look: Look) -> Targets:
 
 def slide_cabinet(look: Look) -> Targets:
     """Move the handle to the right."""
-    at = look.site("slide_site")
+    at = look.handle("slide cabinet")
     is_open = lambda: look.qpos(19) > 0.2  # noqa: E731
     yield from move(look, beside(at, -0.09, -0.10, -0.05), within=0.02, steps=40)
     yield from move(look, beside(at, -0.07, 0.02, -0.05), steps=15)
@@ -190,19 +195,19 @@ def slide_cabinet(look: Look) -> Targets:
 
 def bottom_burner(look: Look) -> Targets:
     """Turn the left knob of the lower row."""
-    return _turn_knob(look, "knob2_site", 11, rise=0.3)
+    return _turn_knob(look, "bottom burner", 11, rise=0.3)
 
 
 def top_burner(look: Look) -> Targets:
     """Turn the left knob of the upper row."""
-    return _turn_knob(look, "knob4_site", 15, rise=0.5)
+    return _turn_knob(look, "top burner", 15, rise=0.5)
 
 
-def _turn_knob(look: Look, site: str, number: int, rise: float) -> Targets:
+def _turn_knob(look: Look, subtask: str, number: int, rise: float) -> Targets:
     """Push the top of the knob's bar to the right, the fingers tilted so that the wrist has room."""
     side, depth = 0.3, 0.012
     rotation = frame([side, np.sqrt(1 - rise * rise - side * side), rise], [1, 0, 0])
-    top, back = beside(look.site(site), 0.0, 0.0, 0.035), 0.1 * rotation[:, 2]
+    top, back = beside(look.handle(subtask), 0.0, 0.0, 0.035), 0.1 * rotation[:, 2]
     turned = lambda: look.qpos(number) < -0.80  # noqa: E731
     yield from move(look, beside(top, -0.055, 0.0, 0.0) - back, within=0.02, steps=35, rotation=rotation)
     yield from move(look, beside(top, -0.045, depth, 0.0), within=0.012, steps=15, rotation=rotation)
