@@ -60,23 +60,29 @@ class HandFrame:
         is as seen from the tips.
         """
         tips, rotation, handles = self._places(observation)
-        turned = rotation.reshape(*rotation.shape[:-2], 9)
-        return jnp.concatenate([observation, tips - pose, turned, *(place - tips for place in handles)], axis=-1)
+        return jnp.concatenate([observation, tips - pose, rotation, *(place - tips for place in handles)], axis=-1)
 
     def _places(self, observation: jax.Array) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
-        """Return the tips [..., 3], link 7's rotation [..., 3, 3], and the handles' places, [..., 3] each."""
-        qpos = observation[..., self._observed]
-        still = jnp.zeros((*qpos.shape[:-1], 3)), jnp.broadcast_to(jnp.eye(3), (*qpos.shape[:-1], 3, 3))
-        found = {0: still}
+        """Return the tips [..., 3], link 7's rotation [..., 9], and the handles' places, [..., 3] each."""
+        qpos = observation[..., self._observed].reshape(-1, len(self._observed)).T
+        found = {0: (jnp.zeros((3, 1)), jnp.eye(3)[:, :, None])}
         for number, body in self._bodies.items():
-            found[number] = body.place(qpos, *found[body.parent])
+            # Without the barrier XLA fuses the chain, and finds a body's parents anew for each of its twelve numbers.
+            found[number] = jax.lax.optimization_barrier(body.place(qpos, *found[body.parent]))
+
+        def rows(numbers: jax.Array) -> jax.Array:
+            shape = (*observation.shape[:-1], len(numbers))
+            return jnp.broadcast_to(numbers, (len(numbers), qpos.shape[1])).T.reshape(shape)
+
         place, rotation = found[self._hand]
-        handles = [found[body][0] + found[body][1] @ offset for body, offset in self._sites]
-        return place + TIP * rotation[..., 2], rotation, handles
+        handles = [rows(found[body][0] + _apply(found[body][1], offset)) for body, offset in self._sites]
+        return rows(place + TIP * rotation[:, 2]), rows(rotation.reshape(9, -1)), handles
 
 
 class _Body:
-    """Place a body by its parent's place and its joints, as ``mj_kinematics`` does.
+    """Place a body by its parent's place and its joints, as ``mj_kinematics`` does, of n states at once.
+
+    The states are the last axis: few numbers of many states, which one vector instruction takes.
 
     Args:
         model: which it is part of.
@@ -90,8 +96,8 @@ class _Body:
         self._joints = [_Joint(model, joint) for joint in range(first, first + int(model.body_jntnum[body]))]
 
     def place(self, qpos: jax.Array, place: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return (place[..., 3], rotation[..., 3, 3]) for those of the parent."""
-        place, rotation = place + rotation @ self._offset, rotation @ self._turn
+        """Return (place[3, n], rotation[3, 3, n]) at ``qpos[nq, n]``, for those of the parent."""
+        place, rotation = place + _apply(rotation, self._offset), _times(rotation, self._turn[:, :, None])
         for joint in self._joints:
             place, rotation = joint.move(qpos, place, rotation)
         return place, rotation
@@ -115,14 +121,24 @@ class _Joint:
         """Return the body's place and rotation after the joint."""
         if self._kind == _FREE:
             at = self._address
-            return qpos[..., at : at + 3], _rotation(qpos[..., at + 3 : at + 7])
-        by = (qpos[..., self._address] - self._rest)[..., None]
+            return qpos[at : at + 3], _rotation(qpos[at + 3 : at + 7])
+        by = qpos[self._address] - self._rest
         if self._kind == _SLIDE:
-            return place + by * (rotation @ self._axis), rotation
-        fixed = place + rotation @ self._anchor
-        sine, rest = jnp.sin(by)[..., None], 1 - jnp.cos(by)[..., None]
-        rotation = rotation @ (jnp.eye(3) + sine * self._cross + rest * (self._cross @ self._cross))
-        return fixed - rotation @ self._anchor, rotation
+            return place + by * _apply(rotation, self._axis), rotation
+        fixed = place + _apply(rotation, self._anchor)
+        once, twice = self._cross[:, :, None], (self._cross @ self._cross)[:, :, None]
+        rotation = _times(rotation, np.eye(3)[:, :, None] + jnp.sin(by) * once + (1 - jnp.cos(by)) * twice)
+        return fixed - _apply(rotation, self._anchor), rotation
+
+
+def _times(first: jax.Array, then: jax.Array | np.ndarray) -> jax.Array:
+    """Return the products [3, 3, n] of matrices first[3, 3, n] and then[3, 3, n]."""
+    return (first[:, :, None] * then[None]).sum(axis=1)
+
+
+def _apply(rotation: jax.Array, vector: np.ndarray) -> jax.Array:
+    """Return ``vector[3]`` turned by ``rotation[3, 3, n]``: [3, n]."""
+    return (rotation * vector[:, None]).sum(axis=1)
 
 
 def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
@@ -141,12 +157,11 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _rotation(quaternion: jax.Array) -> jax.Array:
-    """Return the rotations [..., 3, 3] of ``quaternion[..., 4]``, which sensors leave short of length 1."""
-    quaternion = quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)
-    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    """Return the rotations [3, 3, n] of ``quaternion[4, n]``, which sensors leave short of length 1."""
+    w, x, y, z = quaternion / jnp.linalg.norm(quaternion, axis=0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return jnp.stack([jnp.stack(row) for row in rows])

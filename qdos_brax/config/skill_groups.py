@@ -73,7 +73,7 @@ class SkillsConfig:
     view: str = choice(
         "world",
         "frame in which skills see the body: world (the observation as it is), start (from where it stood and faced "
-        "when the skill began) or body (from where it stands and faces now)",
+        "when the skill began) or body (from where it stands and faces now); an arm's: from its finger tips",
         "world",
         "start",
         "body",
