@@ -136,7 +136,7 @@ class MazeTruth:
     def outcome(self, before: State, after: State) -> np.ndarray:
         """Return where the body got, as seen from its start."""
         start, end = (np.asarray(states.pipeline_state.qpos) for states in (before, after))
-        pose = np.asarray(self._env.body_frame.pose(jnp.asarray(start)))  # an ant's observation begins with its qpos
+        pose = np.asarray(self._env.body_frame.pose(before.obs))
         turn = pose[:, 2] - 1j * pose[:, 3]
         moved = ((end[..., 0] - start[:, 0]) + 1j * (end[..., 1] - start[:, 1])) * turn
         return np.stack([moved.real, moved.imag], axis=-1)

@@ -40,9 +40,8 @@ class HandFrame:
         self._hand, sites = model.body(HAND).id, [model.site(name) for name in HANDLES.values()]
         self._sites = [(int(site.bodyid[0]), site.pos.copy()) for site in sites]
         needed = {body for end in (self._hand, *(body for body, _ in self._sites)) for body in _ancestors(model, end)}
-        self._bodies = {
-            body: _Body(model, body) for body in sorted(needed)
-        }  # a parent's number is below its children's
+        # In this order: a parent's number is below its children's.
+        self._bodies = {body: _Body(model, body) for body in sorted(needed)}
 
     def size(self, observation_size: int) -> int:
         """Return the numbers of ``see``."""
