@@ -24,7 +24,7 @@ _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE
 
 
 class HandFrame:
-    """See the kitchen from the finger tips, by the kinematics of what the arm's and the things' sensors say.
+    """Show the kitchen from the finger tips, by the kinematics of what the arm's and the things' sensors say.
 
     A pose is the place of the tips (m). Nothing is read that is not in the observation.
 

@@ -119,7 +119,7 @@ def test_kill_9_resumes_exactly(tmp_path: Path, whole: Path, phase: str, chunks:
 def test_a_signal_saves_and_says_how_to_go_on(tmp_path: Path, whole: Path, numbers: list[signal.Signals]) -> None:
     """A session that ends hangs up more than once."""
     path = tmp_path / "my run"
-    process = start(path, 0.3)
+    process = start(path, 1.0)  # long enough for a busy machine to send the signal before the run has ended
     wait_for_rows(process, path, 4 * 2)
     for number in numbers:
         process.send_signal(number)
