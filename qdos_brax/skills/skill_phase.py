@@ -29,6 +29,9 @@ from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
 
 
+_UPDATES_PER_CHUNK = 1_000  # at most, where a block is not longer: a run looks for signals between chunks
+
+
 class SkillPhaseState(struct.PyTreeNode):
     """Hold what the phase carries, every leaf [members, ...].
 
@@ -67,7 +70,8 @@ class SkillPhase(MemberPhase):
         weights: where segment advantages come from.
         information: the mutual-information term, or None to leave it out.
         view: what the model's view knows of the data.
-        blocks_per_chunk: blocks between two looks of the host.
+        blocks_per_chunk: blocks between two looks of the host, at most; fewer where they would make more than
+            1,000 gradient steps.
     """
 
     def __init__(
@@ -88,7 +92,7 @@ class SkillPhase(MemberPhase):
         self._finds_temperature = asks_auto(config.skills.advantage_temperature)
         total_blocks = -(-self._skills.updates // self._skills.mi_every)
         self._rate = rate_schedule(self._skills.schedule, total_blocks * self._skills.mi_every)
-        self._blocks = min(blocks_per_chunk, total_blocks)
+        self._blocks = min(blocks_per_chunk, total_blocks, max(1, _UPDATES_PER_CHUNK // self._skills.mi_every))
         super().__init__("skills", "pretrain", -(-total_blocks // self._blocks))
 
     def bind(self, population: Population, data: DeviceData) -> None:

@@ -37,3 +37,11 @@ def test_runs_from_before_there_was_a_schedule_keep_their_hash() -> None:
     plain = configs.config_hash(point_config())
     assert configs.config_hash(point_config(**{"skills.schedule": "constant"})) == plain
     assert configs.config_hash(point_config(**{"skills.schedule": "cosine"})) != plain
+
+
+@pytest.mark.parametrize(("mi_every", "updates"), [(50, 500), (100, 1_000), (400, 800), (1_500, 1_500)])
+def test_a_chunk_ends_before_a_thousand_updates_unless_its_block_is_longer(mi_every: int, updates: int) -> None:
+    """Signals are looked for, and checkpoints written, between chunks."""
+    config = point_config(**{"skills.updates": 6_000, "skills.mi_every": mi_every})
+    phase = SkillPhase(config, SkillModel(2, 2, config.skills), UniformWeights(), None)
+    assert phase.num_chunks == -(-6_000 // updates)
