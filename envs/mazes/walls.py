@@ -7,6 +7,7 @@ model without a change of the physics, so that a step costs the same in every ma
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -66,7 +67,15 @@ class MazeRig(Rig):
         self._bodies = list(bodies)
         self._wall_geoms = np.asarray([k for k in range(model.ngeom) if "_wall_" in model.geom(k).name], int)
         self._corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
-        self._quarters = _walls_by_quarter(layout, self._corner)
+        quarters = _walls_by_quarter(layout, self._corner)
+        self._quarters = quarters.reshape(-1, WALLS)
+        # Columns of qpos, x and y of each body in turn, and as many numbers that make one number of a quarter's two.
+        self._corners = np.tile(self._corner, len(self._bodies))
+        self._columns = np.concatenate([np.arange(place, place + 2) for place in bodies])
+        rows, columns = quarters.shape[:2]
+        self._last = np.tile([columns - 1.0, rows - 1.0], len(self._bodies))
+        self._strides = np.array([1, columns])
+        self._placed: weakref.WeakKeyDictionary[Batch, np.ndarray] = weakref.WeakKeyDictionary()
         centres = layout.index_to_xy(np.arange(layout.num_cells + 1))
         height = np.where(np.arange(layout.num_cells + 1) < layout.num_cells, WALL_HALF_SIZE[2], _SUNK_IN_C)
         self._centres = np.concatenate([centres, height[:, None]], axis=1)
@@ -78,19 +87,25 @@ class MazeRig(Rig):
 
     def identity(self) -> bytes:
         """Return the class, the walls in reach of each place, the bodies and the sensors."""
-        arrays = (self._wall_geoms, self._corner, self._quarters, self._centres)
+        arrays = (self._wall_geoms, self._corner, self._strides, self._quarters, self._centres)
         content = b"".join(repr((array.shape, array.dtype)).encode() + array.tobytes() for array in arrays)
         return super().identity() + content + repr((self._bodies, self._sensors)).encode()
 
     def before(self, batch: Batch, extra: np.ndarray) -> None:
         """Move each body's boxes to the walls around it; those without a wall stay out of reach."""
-        qpos = batch.bind("qpos")
-        points = np.nan_to_num(np.stack([qpos[:, place : place + 2] for place in self._bodies], axis=1))
-        quarters = np.floor((points - self._corner)[..., ::-1] * (2 / UNIT))
-        last = np.asarray(self._quarters.shape[:2]) - 1
-        row, column = np.moveaxis(np.clip(quarters, 0, last).astype(int), -1, 0)
-        index = self._quarters[row, column].reshape(batch.nsim, -1)
-        batch.expand("geom_pos")[:, self._wall_geoms] = self._centres[index]
+        quarters = self._quarters_of(batch.bind("qpos"))
+        placed = self._placed.get(batch)
+        # A body stays in a quarter for many steps, and small batches pay for every call of NumPy.
+        if placed is None or placed.tobytes() != quarters.tobytes():
+            index = self._quarters[quarters].reshape(batch.nsim, -1)
+            batch.expand("geom_pos")[:, self._wall_geoms] = self._centres[index]
+            self._placed[batch] = quarters
+
+    def _quarters_of(self, qpos: np.ndarray) -> np.ndarray:
+        """Return int[n, bodies], the quarter of a cell that each body is in, or the nearest; any one for NaN."""
+        quarters = (qpos[:, self._columns] - self._corners) * (2 / UNIT)
+        held = np.fmax(np.fmin(quarters, self._last), 0.0).astype(int)
+        return held.reshape(len(qpos), -1, 2) @ self._strides
 
     def start(self, batch: Batch, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (no memory, what the body senses)."""

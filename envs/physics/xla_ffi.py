@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -203,7 +204,7 @@ def _view(pointer: Any) -> np.ndarray:
     """Return the buffer as an array on XLA's memory."""
     buffer = pointer.contents
     shape, dtype = tuple(buffer.dims[: buffer.rank]), _DTYPES[buffer.dtype]
-    count = int(np.prod(shape, dtype=int)) * dtype.itemsize
+    count = math.prod(shape) * dtype.itemsize
     if count == 0:
         return np.empty(shape, dtype)  # XLA may give no address
     memory: Any = (ctypes.c_char * count).from_address(buffer.data)

@@ -30,18 +30,11 @@ class BC:
         observation_dim: width of observations.
         action_dim: width of actions.
         config: widths and batch size.
-        learned_std: a Gaussian policy; False makes it deterministic (least squares).
     """
 
-    def __init__(
-        self,
-        observation_dim: int,
-        action_dim: int,
-        config: PolicyConfig,
-        learned_std: bool = True,
-    ) -> None:
+    def __init__(self, observation_dim: int, action_dim: int, config: PolicyConfig) -> None:
         self.observation_dim, self.action_dim, self.batch_size = observation_dim, action_dim, config.batch_size
-        self.policy = GaussianPolicy(config.hidden, action_dim, learned_std)
+        self.policy = GaussianPolicy(config.hidden, action_dim)
 
     def init(self, key: jax.Array, hyper: dict[str, jax.Array]) -> BCState:
         """Return fresh parameters."""

@@ -28,7 +28,6 @@ from qdos_brax.skills.temperature import effective_share, member_temperature
 from qdos_brax.skills.vae import Segments, SkillModel
 from qdos_brax.skills.weights import advantage_weights
 
-
 _UPDATES_PER_CHUNK = 1_000  # at most, where a block is not longer: a run looks for signals between chunks
 
 

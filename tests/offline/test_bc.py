@@ -7,8 +7,9 @@ import pytest
 
 from qdos_brax.config import PolicyConfig
 from qdos_brax.offline.bc import BC
+from qdos_brax.offline.policy import GaussianPolicy, weighted_imitation_loss
 from tests.offline.gridworld import device_data
-from tests.offline.training import train, train_members
+from tests.offline.training import train_members
 
 STATES = 5
 
@@ -43,16 +44,12 @@ def test_a_gaussian_policy_has_the_empirical_means_and_spread(logged):
     assert not np.allclose(mean[1], empirical, atol=0.3)
 
 
-@pytest.mark.slow
-def test_a_deterministic_policy_is_least_squares(logged):
-    state, action, data = logged
-    learner = BC(STATES, 2, SIZES, learned_std=False)
-    trained, _ = train(learner, data, {"policy.learning_rate": 3e-3}, 1500)
-    acted = learner.act(learner.params(trained), jnp.eye(STATES))
-    empirical = np.stack([action[state == s].mean(axis=0) for s in range(STATES)])
-    np.testing.assert_allclose(acted, empirical, atol=0.08)
-    # -log N(a; mean, 1) is half the squared error plus log(2 pi) for two dimensions.
-    some = jnp.zeros((3, STATES)), jnp.full((3, 2), 0.5)
-    _, info = jax.jit(learner.step)(trained, *some, 0.0)
-    error = jnp.sum((learner.act(learner.params(trained), some[0]) - some[1]) ** 2, axis=-1)
-    np.testing.assert_allclose(info["actor_loss"], jnp.mean(error) / 2 + np.log(2 * np.pi), rtol=1e-5)
+def test_without_a_learned_deviation_likelihood_is_least_squares() -> None:
+    """-log N(a; mean, 1) is half the squared error plus log(2 pi) for two dimensions."""
+    policy, rng = GaussianPolicy((8,), 2, learned_std=False), np.random.default_rng(0)
+    observation, action = rng.normal(size=(6, STATES)), rng.uniform(-1, 1, (6, 2))
+    weight = np.array([0.0, 1.0, 0.5, 2.0, 1.0, 0.1])
+    params = policy.init(jax.random.key(0), observation)
+    error = np.sum((np.asarray(policy.apply(params, observation)[0]) - action) ** 2, axis=-1)
+    loss = weighted_imitation_loss(policy, params, observation, action, weight)
+    np.testing.assert_allclose(loss, np.mean(weight * (error / 2 + np.log(2 * np.pi))), rtol=1e-5)

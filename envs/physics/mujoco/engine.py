@@ -8,6 +8,7 @@ arguments.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import jax
@@ -126,7 +127,7 @@ class MujocoEngine:
     ) -> tuple[np.ndarray, ...]:
         """Make a step of the whole batch: NumPy only, since jax inside a callback can deadlock (jax issue 24255)."""
         lead = np.shape(fresh)
-        n = int(np.prod(lead, dtype=int))
+        n = math.prod(lead)
         extra, noise = self._optional(n, more)
         step = self._stepper.step(
             _numbers(bits).reshape(n, -1),
@@ -156,7 +157,7 @@ class MujocoEngine:
     def _start_batch(self, *arrays: jax.Array) -> tuple[np.ndarray, ...]:
         """Return what the rig remembers and senses at (qpos, qvel, extra), for the whole batch."""
         lead = np.shape(arrays[0])[:-1]
-        n = int(np.prod(lead, dtype=int))
+        n = math.prod(lead)
         qpos, qvel, *more = arrays
         memory, sensed = self._stepper.start(
             np.asarray(qpos).reshape(n, -1), np.asarray(qvel).reshape(n, -1), *self._optional(n, more)

@@ -15,6 +15,7 @@ from mujoco.batch import Batch
 from envs.physics.mujoco.rig import Rig
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_MOST_KEPT = 256  # simulations whose MjData are kept: each takes the model's arena of address space
 _TINY = float(np.finfo(np.float32).tiny)  # XLA takes float32 numbers below it for 0
 
 
@@ -101,22 +102,29 @@ class BatchStepper:
         rig, memory = self._rig, exact[:, self.nstate :]
         with self._batch(len(exact)) as batch:
             np.copyto(batch.state, exact[:, : self.nstate])
-            batch.state[fresh] = self._rest
-            for name, start, values in (("qpos", self._fresh_qpos(qpos), qpos), ("qvel", qvel, qvel)):
-                held = batch.bind(name)
-                held[:] = np.where(fresh[:, None], start, with_changes(held, values))
+            self._begin(batch, fresh, qpos, qvel)
             # A state that is not finite stays as it is, for the task to see; MuJoCo would spend long on it.
-            sound = np.isfinite(batch.state).all(axis=1)
+            finite = np.isfinite(batch.state)
+            ids = None if finite.all() else np.flatnonzero(finite.all(axis=1))
             rig.before(batch, extra)
             qpos_before = batch.bind("qpos").copy()
             batch.bind("ctrl")[:] = rig.ctrl(qpos_before, batch.bind("qvel"), memory, extra, action)
-            ids = None if sound.all() else np.flatnonzero(sound)
             batch.step(ids=ids, nstep=self._frame_skip, stage=int(rig.stage))
             rows = np.empty_like(exact)
             memory, extra, sensed = rig.after(batch, qpos_before, memory, extra)
             rows[:, self.nstate :], sensed = self._disturbed(memory, sensed, noise)
             rows[:, : self.nstate] = batch.state
         return BatchStep(rows, extra, sensed)
+
+    def _begin(self, batch: Batch, fresh: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Put fresh rows of ``batch`` at rest at (qpos, qvel), and the others where they were changed by hand."""
+        held, moving = batch.bind("qpos"), batch.bind("qvel")
+        # Most steps have neither, and small batches pay for every call of NumPy.
+        if not fresh.any() and _rounds_to(held, qpos) and _rounds_to(moving, qvel):
+            return
+        batch.state[fresh] = self._rest
+        held[:] = np.where(fresh[:, None], self._fresh_qpos(qpos), with_changes(held, qpos))
+        moving[:] = np.where(fresh[:, None], qvel, with_changes(moving, qvel))
 
     def _fresh_qpos(self, qpos: np.ndarray) -> np.ndarray:
         """Return where fresh states at ``qpos`` (float32[n, nq]) start: there, or at the float64 that it stands for."""
@@ -141,7 +149,10 @@ class BatchStepper:
         try:
             batch = self._idle[n].pop()
         except IndexError:
-            batch = _ViewKeepingBatch(self._model, nsim=n, nthread=min(self._threads, n))
+            # Where each simulation keeps its MjData, a step goes on from the forward pass after the one before, if
+            # neither state nor model were changed in between; the bits are the same.
+            kept = self._rig.stage != mujoco.mjtStage.mjSTAGE_NONE and n <= _MOST_KEPT
+            batch = _ViewKeepingBatch(self._model, nsim=n, nthread=min(self._threads, n), persistent=kept)
             for name in self._rig.fields:  # a field is filled from the first call after it was bound
                 batch.bind(name)
         yield batch
@@ -160,6 +171,11 @@ class _ViewKeepingBatch(Batch):
         if name not in self._views:
             self._views[name] = super().bind(name)
         return self._views[name]
+
+
+def _rounds_to(exact: np.ndarray, values: np.ndarray) -> bool:
+    """Return whether ``values`` (float32) are the roundings of ``exact`` (float64), bit for bit."""
+    return exact.astype(np.float32).tobytes() == values.tobytes()
 
 
 def with_changes(exact: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -11,9 +11,13 @@ CurveRow = dict[str, float]  # of a curve: numbers by column
 
 
 def read_curve(path: Path) -> list[CurveRow]:
-    """Return the rows of a curve's CSV file."""
+    """Return the rows of a curve's CSV file; what was written without a point is an int, and is written so again."""
     with open(path, encoding="utf-8") as file:
-        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+        return [{key: _number(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+def _number(text: str) -> float:
+    return int(text) if text.lstrip("-").isdigit() else float(text)
 
 
 def command_line(module: str, subject: str, args: argparse.Namespace, names: Sequence[str]) -> str:

@@ -17,4 +17,7 @@ def test_the_command_line_is_recorded_without_folders() -> None:
 
 def test_a_curve_is_read_as_numbers_by_column(tmp_path: Path) -> None:
     (tmp_path / "curve.csv").write_text("steps,speed\n64,0.5\n128,-2e-3\n")
-    assert read_curve(tmp_path / "curve.csv") == [{"steps": 64, "speed": 0.5}, {"steps": 128, "speed": -0.002}]
+    rows = read_curve(tmp_path / "curve.csv")
+    assert rows == [{"steps": 64, "speed": 0.5}, {"steps": 128, "speed": -0.002}]
+    # A training that goes on writes the old rows again: counts must not become 64.0.
+    assert [type(value) for value in rows[0].values()] == [int, float]
