@@ -63,7 +63,7 @@ def test_what_is_kept_changes_no_bit(task: str, monkeypatch: pytest.MonkeyPatch)
     expected = rollouts(plain)
     monkeypatch.undo()
     found = rollouts(kept)
-    assert kept._idle[N][0].persistent == (task == "humanoidmaze-medium")
+    assert next(iter(kept._idle.values()))[0].persistent == (task == "humanoidmaze-medium")
     assert len({step.tobytes() for step in found}) == len(found)
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -97,3 +97,20 @@ def test_quarters_are_the_nearest_ones_of_any_place() -> None:
         np.testing.assert_array_equal(rig._quarters_of(qpos)[:, body], expected)
     qpos[2, 0] = np.nan
     assert 0 <= rig._quarters_of(qpos)[2, 0] < rows * columns
+
+
+def test_calls_at_once_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A call that finds another one at work takes half of the threads; the numbers are the same."""
+    stepper = stepper_of("antsoccer-arena")
+    monkeypatch.setattr(stepper, "_threads", 2)
+    places = starts(stepper, 3.0)
+    alone = step(stepper, None, places, 0)
+    with steppers._calls.one_more() as calls:
+        assert calls == 1
+        beside = step(stepper, None, places, 0)
+    assert [key for key, idle in stepper._idle.items() if idle] == [(N, 2), (N, 1)]
+    np.testing.assert_array_equal(beside.exact, alone.exact)
+    with pytest.raises(ZeroDivisionError), steppers._calls.one_more():
+        _ = 1 // 0
+    with steppers._calls.one_more() as calls:
+        assert calls == 1

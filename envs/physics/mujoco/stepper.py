@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,7 +41,7 @@ class BatchStepper:
         model: the compiled model; no activation states and no plugins.
         rig: what connects actions, model and sensors to the task.
         frame_skip: sub-steps per control step.
-        threads: threads of a batch; None takes the cores this process may use.
+        threads: threads of a batch; None takes the cores this process may use. Calls at once share them.
     """
 
     def __init__(self, model: mujoco.MjModel, rig: Rig, frame_skip: int, threads: int | None = None) -> None:
@@ -51,7 +52,7 @@ class BatchStepper:
         self._threads = threads or len(os.sched_getaffinity(0))
         self._rest = _rest_row(model)
         self._exact_qpos = rig.exact_qpos
-        self._idle: dict[int, list[Batch]] = defaultdict(list)
+        self._idle: dict[tuple[int, int], list[Batch]] = defaultdict(list)
 
     def identity(self) -> bytes:
         """Return all that decides what a step computes, but for the rig's share."""
@@ -146,17 +147,43 @@ class BatchStepper:
     @contextmanager
     def _batch(self, n: int) -> Iterator[Batch]:
         """Yield a batch of n that no other thread uses: programs on several devices call the engine at once."""
+        with _calls.one_more() as calls:
+            threads = min(n, max(1, self._threads // calls))
+            idle = self._idle[n, threads]
+            batch = idle.pop() if idle else self._new_batch(n, threads)
+            yield batch
+            idle.append(batch)
+
+    def _new_batch(self, n: int, threads: int) -> Batch:
+        # Where each simulation keeps its MjData, a step goes on from the forward pass after the one before, if neither
+        # state nor model were changed in between; the bits are the same.
+        kept = self._rig.stage != mujoco.mjtStage.mjSTAGE_NONE and n <= _MOST_KEPT
+        batch = _ViewKeepingBatch(self._model, nsim=n, nthread=threads, persistent=kept)
+        for name in self._rig.fields:  # a field is filled from the first call after it was bound
+            batch.bind(name)
+        return batch
+
+
+class _Calls:
+    """Count the calls that step at once: members of a scan on two cores would wake four threads."""
+
+    def __init__(self) -> None:
+        self._lock, self._count = threading.Lock(), 0
+
+    @contextmanager
+    def one_more(self) -> Iterator[int]:
+        """Yield how many there are, this one included."""
+        with self._lock:
+            self._count += 1
+            count = self._count
         try:
-            batch = self._idle[n].pop()
-        except IndexError:
-            # Where each simulation keeps its MjData, a step goes on from the forward pass after the one before, if
-            # neither state nor model were changed in between; the bits are the same.
-            kept = self._rig.stage != mujoco.mjtStage.mjSTAGE_NONE and n <= _MOST_KEPT
-            batch = _ViewKeepingBatch(self._model, nsim=n, nthread=min(self._threads, n), persistent=kept)
-            for name in self._rig.fields:  # a field is filled from the first call after it was bound
-                batch.bind(name)
-        yield batch
-        self._idle[n].append(batch)
+            yield count
+        finally:
+            with self._lock:
+                self._count -= 1
+
+
+_calls = _Calls()
 
 
 class _ViewKeepingBatch(Batch):
