@@ -23,7 +23,7 @@ from qdos_brax.population.members import Population
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
 
-COLUMNS = ("env", "method", "settings", "seed", "env_steps", "eval_success", "first_goal_step", "seconds")
+COLUMNS = ("env", "method", "settings", "seed", "env_steps", "eval_success", "eval_score", "first_goal_step", "seconds")
 AFTER_SKILLS = ("label", "online")
 
 
@@ -48,7 +48,7 @@ def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, 
             state, info = phase.chunk(state, constants)
             if "eval/success" in info:
                 new = _rows(config, chosen, settings, info, time.perf_counter() - began)
-                print(f"{new[0]['env_steps']} steps: {', '.join(row['eval_success'] for row in new)}", flush=True)
+                print(f"{new[0]['env_steps']} steps: {', '.join(_shown(row) for row in new)}", flush=True)
                 rows += new
         artifacts = phase.finish(state, artifacts)
     return rows
@@ -63,11 +63,17 @@ def _rows(config: Any, members: list[Any], settings: list[str], info: Any, secon
             "seed": member["seed"],
             "env_steps": int(info["env_steps"][k]),
             "eval_success": f"{float(info['eval/success'][k]):.3g}",
+            "eval_score": f"{float(info['eval/score'][k]):.3g}" if "eval/score" in info else "",
             "first_goal_step": f"{float(info['first_goal_step'][k]):.0f}".replace("nan", ""),
             "seconds": f"{seconds:.0f}",
         }
         for k, member in enumerate(members)
     ]
+
+
+def _shown(row: dict[str, Any]) -> str:
+    """Return the success, and the score of a task that has parts."""
+    return row["eval_success"] + (f" (score {row['eval_score']})" if row["eval_score"] else "")
 
 
 def main() -> None:

@@ -48,16 +48,20 @@ class Method:
 
 _MANIPULATION = ("cube", "kitchen", "scene")
 
+# What the bonus sees, and which skill a segment is said to have played, in the published code of SUPE, ExPLORe and
+# their comparisons. In a task's own units a new place is a large error; normalised, it led SUPE to no goal of a maze.
+_SUPES_LABELS = {"labels.inputs": "raw", "labels.latent": "mean"}
+
 # What an offline row earns without its reward: the least there is on the mazes, what a model of the online rewards
 # predicts in manipulation (Wilcoxson et al. 2025, appendix and published commands; the ball's tasks as the mazes).
-_UNLABELLED = {"labels.offline_reward": "min"}
+_UNLABELLED = _SUPES_LABELS | {"labels.offline_reward": "min"}
 _UNLABELLED_BY_FAMILY = {family: {"labels.offline_reward": "pred"} for family in _MANIPULATION}
 
 # The dimension that HILP was published with on mazes and kitchen.
 _DIRECTIONS = {"skills.latent_dim": 32}
 
 # Nothing of the data but the skills.
-_ONLINE_ONLY = {"high_level.offline_fraction": 0.0, "labels.bonus_rows": "online"}
+_ONLINE_ONLY = _SUPES_LABELS | {"high_level.offline_fraction": 0.0, "labels.bonus_rows": "online"}
 
 # One action per decision, one step per segment.
 _FLAT = {"skills.horizon": 1}

@@ -116,6 +116,14 @@ def test_published_values() -> None:
     assert (kitchen["wsrl"].values.expectile, kitchen["wsrl"].flow.updates) == (0.7, 250_000)
 
 
+@pytest.mark.parametrize("preset", ["cpu", "paper", "smoke"])
+def test_rivals_with_a_bonus_have_the_labels_of_supes_code_in_every_preset(preset: str) -> None:
+    """Of normalised observations the bonus is small, and supe found no goal of antmaze-large (results.md)."""
+    for method in ("supe", "explore", "hilp", "hilp-online", "trajectory-skills", "diffusion-jsrl"):
+        labels = configs.load_config("antmaze-large", preset, {"method": method}).labels
+        assert (labels.inputs, labels.latent) == ("raw", "mean"), method
+
+
 def test_a_flat_method_refuses_skills() -> None:
     with pytest.raises(UserError, match=r"rlpd has no skills.*horizon must stay 1, not 5"):
         phases_of(config_of("rlpd", **{"skills.horizon": 5}), point_dataset(20))
