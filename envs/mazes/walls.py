@@ -66,15 +66,15 @@ class MazeRig(Rig):
     def __init__(self, model: mujoco.MjModel, layout: Maze, bodies: Sequence[int], sensors: Sensors | None) -> None:
         self._bodies = list(bodies)
         self._wall_geoms = np.asarray([k for k in range(model.ngeom) if "_wall_" in model.geom(k).name], int)
-        self._corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
-        quarters = _walls_by_quarter(layout, self._corner)
-        self._quarters = quarters.reshape(-1, WALLS)
-        # Columns of qpos, x and y of each body in turn, and as many numbers that make one number of a quarter's two.
-        self._corners = np.tile(self._corner, len(self._bodies))
-        self._columns = np.concatenate([np.arange(place, place + 2) for place in bodies])
+        corner = np.asarray(layout.ij_to_xy((0, 0))) - 0.5 * UNIT
+        quarters = _walls_by_quarter(layout, corner)
         rows, columns = quarters.shape[:2]
+        self._quarters = quarters.reshape(-1, WALLS)
+        # Of x and y of each body in turn: where in qpos they lie, where their quarters begin, and the last of these.
+        self._columns = np.concatenate([np.arange(place, place + 2) for place in bodies])
+        self._corner = np.tile(corner, len(self._bodies))
         self._last = np.tile([columns - 1.0, rows - 1.0], len(self._bodies))
-        self._strides = np.array([1, columns])
+        self._strides = np.array([1, columns])  # of a quarter's x and y in the table
         self._placed: weakref.WeakKeyDictionary[Batch, np.ndarray] = weakref.WeakKeyDictionary()
         centres = layout.index_to_xy(np.arange(layout.num_cells + 1))
         height = np.where(np.arange(layout.num_cells + 1) < layout.num_cells, WALL_HALF_SIZE[2], _SUNK_IN_C)
@@ -103,7 +103,7 @@ class MazeRig(Rig):
 
     def _quarters_of(self, qpos: np.ndarray) -> np.ndarray:
         """Return int[n, bodies], the quarter of a cell that each body is in, or the nearest; any one for NaN."""
-        quarters = (qpos[:, self._columns] - self._corners) * (2 / UNIT)
+        quarters = (qpos[:, self._columns] - self._corner) * (2 / UNIT)
         held = np.fmax(np.fmin(quarters, self._last), 0.0).astype(int)
         return held.reshape(len(qpos), -1, 2) @ self._strides
 

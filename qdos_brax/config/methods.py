@@ -49,7 +49,8 @@ class Method:
 _MANIPULATION = ("cube", "kitchen", "scene")
 
 # What the bonus sees, and which skill a segment is said to have played, in the published code of SUPE, ExPLORe and
-# their comparisons. In a task's own units a new place is a large error; normalised, it led SUPE to no goal of a maze.
+# their comparisons. In a task's own units a new place is a large error; with qdos's labels SUPE found no goal of
+# antmaze-large (docs/results.md).
 _SUPES_LABELS = {"labels.inputs": "raw", "labels.latent": "mean"}
 
 # What an offline row earns without its reward: the least there is on the mazes, what a model of the online rewards

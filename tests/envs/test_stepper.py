@@ -92,7 +92,7 @@ def test_quarters_are_the_nearest_ones_of_any_place() -> None:
     qpos[0, 0], qpos[1, 1] = np.inf, -np.inf
     columns, rows = int(rig._last[0]) + 1, int(rig._last[1]) + 1
     for body, first in enumerate((0, 15)):
-        where = np.floor((qpos[:, first : first + 2] - rig._corner) / 2.0)
+        where = np.floor((qpos[:, first : first + 2] - rig._corner[:2]) / 2.0)
         expected = np.clip(where[:, 1], 0, rows - 1) * columns + np.clip(where[:, 0], 0, columns - 1)
         np.testing.assert_array_equal(rig._quarters_of(qpos)[:, body], expected)
     qpos[2, 0] = np.nan

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from qdos_brax.config import PolicyConfig
+from qdos_brax.nn.optim import ADAM, adam_step
 from qdos_brax.offline.bc import BC
 from qdos_brax.offline.policy import GaussianPolicy, weighted_imitation_loss
 from tests.offline.gridworld import device_data
@@ -42,6 +43,22 @@ def test_a_gaussian_policy_has_the_empirical_means_and_spread(logged):
     np.testing.assert_allclose((1 + mean[0, :, 0] / 0.8) / 2, frequency, atol=0.05)
     np.testing.assert_array_equal(log_std[1], 0)
     assert not np.allclose(mean[1], empirical, atol=0.3)
+
+
+@pytest.mark.slow
+def test_a_deterministic_policy_is_least_squares(logged):
+    state, action, _ = logged
+    policy, observation = GaussianPolicy((32,), 2, learned_std=False), jnp.eye(STATES)[state]
+
+    def step(learned, _):
+        params, opt_state = learned
+        grads = jax.grad(weighted_imitation_loss, argnums=1)(policy, params, observation, action, 1.0)
+        return adam_step(params, opt_state, grads, 3e-3), None
+
+    params = policy.init(jax.random.key(0), observation)
+    trained, _ = jax.jit(lambda learned: jax.lax.scan(step, learned, length=1500)[0])((params, ADAM.init(params)))
+    empirical = np.stack([action[state == s].mean(axis=0) for s in range(STATES)])
+    np.testing.assert_allclose(policy.apply(trained, jnp.eye(STATES))[0], empirical, atol=0.08)
 
 
 def test_without_a_learned_deviation_likelihood_is_least_squares() -> None:
