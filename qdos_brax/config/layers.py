@@ -18,6 +18,7 @@ from qdos_brax.errors import UserError
 
 # The folder beside the packages: the repository's root in an editable install, site-packages in a built wheel.
 CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"
+_LOW_LEVELS = sorted({method.low_level for method in METHODS.values()})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,24 +51,25 @@ def run_layers(
     Raises:
         UserError: there is no such task, method, preset or key; the line proposes the nearest.
     """
-    family = _family(Config.env if env is None else env)
+    spec = _spec(Config.env if env is None else env)
     given = known_keys(flags or {}, "a flag")
     chosen = preset or default_preset()
     return [
-        *family_layers(family, given.get("method", Config.method), chosen),
+        *family_layers(spec.family, given.get("method", Config.method), chosen, spec.variant),
         *([] if preset else [Layer("this machine's default", {"preset": chosen})]),
         Layer("flag", {key: value for key, value in (("env", env), ("preset", preset)) if value} | given),
         Layer("--set", dict(_parse_set(text) for text in sets)),
     ]
 
 
-def family_layers(family: str, method: str, preset: str) -> list[Layer]:
+def family_layers(family: str, method: str, preset: str, variant: str | None = None) -> list[Layer]:
     """Return the layers below the flags: the family's YAML, the method, the preset and its sections.
 
     Args:
         family: a task family, registered in ``envs`` or with a YAML; without a YAML it has the defaults.
         method: name of a method.
         preset: name of a preset.
+        variant: of the family's tasks, such as a maze; None leaves out what is for one variant alone.
 
     Raises:
         UserError: there is no such method or preset, or a file has a key that the configuration has not.
@@ -77,7 +79,7 @@ def family_layers(family: str, method: str, preset: str) -> list[Layer]:
     return [
         *([Layer(f"configs/{family}.yaml", read_values(path))] if family in families() else []),
         Layer(f"method {method}", known_keys(method_settings(method, family), f"method {method}")),
-        *_preset_layers(preset, family, METHODS[method].low_level),
+        *_preset_layers(preset, family, variant, METHODS[method].low_level),
     ]
 
 
@@ -145,30 +147,38 @@ def flat(nested: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _family(env: str) -> str:
+def _spec(env: str) -> envs.TaskSpec:
     try:
-        return envs.get_spec(env).family
+        return envs.get_spec(env)
     except ValueError as error:  # envs does not know UserError; its lines are written for the user all the same
         raise UserError(str(error)) from error
 
 
-def _preset_layers(name: str, family: str, low_level: str) -> list[Layer]:
-    """Return a preset's values, those of its sections over them; a family's section may have ``low_level`` again."""
+def _preset_layers(name: str, family: str, variant: str | None, low_level: str) -> list[Layer]:
+    """Return a preset's values, those of its sections over them; a family's section may have ``low_level`` again, and
+    over that ``variants``.
+    """
     if name not in presets():
         raise UserError(f"unknown preset {name!r}{nearest(name, presets())}; there are {', '.join(presets())}")
     path = CONFIG_DIR / "presets" / f"{name}.yaml"
-    content = _read_mapping(path)
-    of_family = _take_section(content, "families", sorted({*families(), *envs.FAMILIES}), path).get(family)
-    layers = []
-    for title, part in ((f"preset {name}", content), (f"preset {name}, section families.{family}", of_family or {})):
-        kinds = sorted({method.low_level for method in METHODS.values()})
-        of_low_level = _take_section(part, "low_level", kinds, path).get(low_level) or {}
-        within = f"{title}." if part is of_family else f"{title}, section "
-        layers += [(title, part), (f"{within}low_level.{low_level}", of_low_level)]
+    content, title = _read_mapping(path), f"preset {name}"
+    sections = _take_section(content, "families", sorted({*families(), *envs.FAMILIES}), path)
+    of_low_level = _take_section(content, "low_level", _LOW_LEVELS, path)
+    layers = [(title, content), (f"{title}, section low_level.{low_level}", of_low_level.get(low_level))]
+    if of_family := sections.get(family):
+        known = sorted(envs.FAMILIES[family].variants) if family in envs.FAMILIES else []
+        of_variant = _take_section(of_family, "variants", known, path)
+        of_low_level = _take_section(of_family, "low_level", _LOW_LEVELS, path)
+        title = f"{title}, section families.{family}"
+        layers += [
+            (title, of_family),
+            (f"{title}.low_level.{low_level}", of_low_level.get(low_level)),
+            (f"{title}.variants.{variant}", of_variant.get(variant)),
+        ]
     return [Layer(title, known_keys(flat(part), str(path))) for title, part in layers if part]
 
 
-def _take_section(content: dict[str, Any], name: str, known: list[str], path: Path) -> dict[str, Any]:
+def _take_section(content: dict[str, Any], name: str, known: Sequence[str], path: Path) -> dict[str, Any]:
     """Remove a section from a preset's content and return it, its names checked."""
     section = content.pop(name, None) or {}
     for key in section:

@@ -75,6 +75,7 @@ families:
     skills: {kl_weight: 0.6}
     high_level: {discount: 0.8}
     low_level: {action: {high_level: {discount: 0.7}}}
+    variants: {medium: {high_level: {discount: 0.6}}}
 """
     (tmp_path / "presets" / "tiny.yaml").write_text(preset)
     monkeypatch.setattr(configs.layers, "CONFIG_DIR", tmp_path)
@@ -92,6 +93,12 @@ families:
     assert (config.high_level.discount, flat.high_level.discount) == (0.8, 0.7)
     assert load_config("antsoccer", "tiny", {"method": "explore"}).high_level.discount == 0.9
     assert flat.labels.rnd_coefficient == 1.0  # --set over method
+    # A variant over its family, for all of its tasks.
+    assert load_config("antmaze-medium-task3", "tiny").high_level.discount == 0.6
+    assert load_config("antmaze-large", "tiny").high_level.discount == 0.8
+    (tmp_path / "presets" / "tiny.yaml").write_text(preset.replace("medium", "medum"))
+    with pytest.raises(UserError, match="unknown entry 'medum' in variants, did you mean 'medium'"):
+        load_config("antmaze-large", "tiny")
 
 
 def _written(value: object) -> str:
