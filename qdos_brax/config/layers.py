@@ -173,8 +173,9 @@ def _preset_layers(name: str, family: str, variant: str | None, low_level: str) 
         layers += [
             (title, of_family),
             (f"{title}.low_level.{low_level}", of_low_level.get(low_level)),
-            (f"{title}.variants.{variant}", of_variant.get(variant)),
         ]
+        if variant is not None:
+            layers.append((f"{title}.variants.{variant}", of_variant.get(variant)))
     return [Layer(title, known_keys(flat(part), str(path))) for title, part in layers if part]
 
 
