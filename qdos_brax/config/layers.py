@@ -18,7 +18,6 @@ from qdos_brax.errors import UserError
 
 # The folder beside the packages: the repository's root in an editable install, site-packages in a built wheel.
 CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"
-_LOW_LEVELS = sorted({method.low_level for method in METHODS.values()})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,18 +161,16 @@ def _preset_layers(name: str, family: str, variant: str | None, low_level: str) 
         raise UserError(f"unknown preset {name!r}{nearest(name, presets())}; there are {', '.join(presets())}")
     path = CONFIG_DIR / "presets" / f"{name}.yaml"
     content, title = _read_mapping(path), f"preset {name}"
+    kinds = sorted({method.low_level for method in METHODS.values()})
     sections = _take_section(content, "families", sorted({*families(), *envs.FAMILIES}), path)
-    of_low_level = _take_section(content, "low_level", _LOW_LEVELS, path)
+    of_low_level = _take_section(content, "low_level", kinds, path)
     layers = [(title, content), (f"{title}, section low_level.{low_level}", of_low_level.get(low_level))]
     if of_family := sections.get(family):
         known = sorted(envs.FAMILIES[family].variants) if family in envs.FAMILIES else []
         of_variant = _take_section(of_family, "variants", known, path)
-        of_low_level = _take_section(of_family, "low_level", _LOW_LEVELS, path)
+        of_low_level = _take_section(of_family, "low_level", kinds, path)
         title = f"{title}, section families.{family}"
-        layers += [
-            (title, of_family),
-            (f"{title}.low_level.{low_level}", of_low_level.get(low_level)),
-        ]
+        layers += [(title, of_family), (f"{title}.low_level.{low_level}", of_low_level.get(low_level))]
         if variant is not None:
             layers.append((f"{title}.variants.{variant}", of_variant.get(variant)))
     return [Layer(title, known_keys(flat(part), str(path))) for title, part in layers if part]
