@@ -17,7 +17,6 @@ the process and its children.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import math
 import os
@@ -34,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 from qdos_brax.files import write_text
+from qdos_brax.runs.metrics import read_rows
 
 THIS = Path(__file__).resolve().parents[1]
 SMOKE = ("--env", "antsoccer-arena", "--alpha", "0.3", "--preset", "smoke")
@@ -123,10 +123,9 @@ class _Watch(threading.Thread):
 
     def run(self) -> None:
         while math.isinf(self.seconds_to_half) and not self._over.wait(1.0):
-            if self._metrics.exists():
-                rows = csv.DictReader(self._metrics.read_text(encoding="utf-8").splitlines())
-                if any(float(row["eval/success"] or 0) >= 0.5 for row in rows):
-                    self.seconds_to_half = time.perf_counter() - self._began
+            rows = read_rows(self._metrics) if self._metrics.exists() else []
+            if any(float(row["eval/success"] or 0) >= 0.5 for row in rows):
+                self.seconds_to_half = time.perf_counter() - self._began
 
     def end(self) -> None:
         """Stop looking."""
