@@ -206,6 +206,13 @@ class Task(Env, ABC):
             info=state.info | {"truncation": capped * mask, "final_obs": obs},
         )
 
+    def idle(self, state: State, over: jax.Array) -> State:
+        """Return what to step in place of ``state`` if nobody reads the result where ``over`` (bool) is True.
+
+        With MuJoCo C an episode that is over then costs no physics while those beside it go on.
+        """
+        return state.replace(pipeline_state=self.engine.idle(state.pipeline_state, over))
+
     def observe(self, pipeline_state: PipelineState) -> jax.Array:
         """Return float32[obs], what is seen of a state; qpos and qvel unless a task overrides it."""
         return jnp.concatenate([pipeline_state.qpos, pipeline_state.qvel])

@@ -110,3 +110,10 @@ class Engine(Protocol):
         step.
         """
         ...
+
+    def idle(self, state: PipelineState, over: jax.Array) -> PipelineState:
+        """Return what to step in place of ``state`` if nobody reads the result where ``over`` (bool) is True.
+
+        The engine may leave such simulations out. The others step as they would have.
+        """
+        ...

@@ -66,17 +66,20 @@ def macro_step(
     """Play ``policy`` for ``horizon`` steps of one environment, batched by ``jax.vmap``; it is a function of the
     observation and of the number of steps before.
 
-    An episode that ends early idles to the end of the macro step: its state stays, and only live steps count. The
-    environment is not reset. A state that is done already gives a macro step of no live steps and reward 0.
+    An episode that ends early idles to the end of the macro step: its state stays, and only live steps count; a task
+    that can (``Task.idle``) spends no physics on it. The environment is not reset. A state that is done already gives
+    a macro step of no live steps and reward 0.
 
     ``record`` says what is kept of each environment step, idle ones included, as the result's ``track``.
     """
+
+    idle = getattr(env, "idle", lambda state, over: state)
 
     def step(carry: tuple[State, MacroStep], index: jax.Array) -> tuple[tuple[State, MacroStep], Any]:
         state, result = carry
         alive = state.done < 0.5
         action = policy(state.obs, index)
-        new = env.step(state, action)
+        new = env.step(idle(state, ~alive), action)
         finite = jnp.all(jnp.isfinite(new.obs)) & jnp.isfinite(new.reward)
         terminated = (new.done > 0.5) & (new.info["truncation"] < 0.5)
         live = alive.astype(jnp.float32)

@@ -87,6 +87,10 @@ class MjxEngine:
         sensed = self._sense(qpos, qvel)
         return state.replace(qpos=qpos, qvel=qvel, sensed=sensed, carry=warmstart, steps=state.steps + 1)
 
+    def idle(self, state: PipelineState, over: jax.Array) -> PipelineState:
+        """Return ``state``: a batch steps as one."""
+        return state
+
     def _move(self, start: Motion, mocap: jax.Array, action: jax.Array) -> Motion:
         """Make all sub-steps, with the mocap bodies at ``mocap[k, 3]``."""
 

@@ -106,6 +106,10 @@ class MujocoEngine:
         carry = MujocoCarry(bits=bits, fresh=jnp.zeros_like(state.carry.fresh), key=key)
         return PipelineState(qpos, qvel, sensed, extra[0] if extra else state.extra, carry, state.steps + 1)
 
+    def idle(self, state: PipelineState, over: jax.Array) -> PipelineState:
+        """Return ``state``, not finite where ``over``: such simulations stay as they are, and cost no physics."""
+        return state.replace(qpos=jnp.where(over, jnp.nan, state.qpos))
+
     def simulations(self, rng: np.random.Generator) -> Simulations:
         """Return simulations to be started and stepped outside jax; ``rng`` is what the sensors' errors come from."""
         return Simulations(self._stepper, self._rig, rng)

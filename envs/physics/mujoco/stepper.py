@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from envs.physics.mujoco import clock
 from envs.physics.mujoco.rig import Rig
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -53,6 +54,7 @@ class BatchStepper:
         self._rest = _rest_row(model)
         self._exact_qpos = rig.exact_qpos
         self._idle: dict[tuple[int, int], list[Batch]] = defaultdict(list)
+        clock.stop()
 
     def identity(self) -> bytes:
         """Return all that decides what a step computes, but for the rig's share."""
