@@ -158,6 +158,7 @@ _AS_BEFORE = {
     ("skills", "alpha_rate"): 0.001,
     ("high_level", "actor_updates"): 1,
     ("high_level", "schedule"): "constant",
+    ("high_level", "actor_average"): 1.0,
     ("high_level", "initial"): "random",
     ("labels", "latent"): "sample",
     ("labels", "inputs"): "normalised",

@@ -67,6 +67,13 @@ class HighLevelConfig:
     schedule: str = schedule("the last environment step")
     discount: Scannable = number(0.99, "discount per macro step", high=1.0)
     target_rate: Scannable = number(0.005, "Polyak rate of the target critics", high=1.0, above=True)
+    actor_average: Scannable = number(
+        1.0,
+        "evaluations and the finished run play a running mean of the actor, which goes this share of the way to it "
+        "after each macro step; 1 is the actor itself",
+        high=1.0,
+        above=True,
+    )
     value_scale: float = number(1.0, "Q per unit of a critic's output", above=True, scan=False)
     init_temperature: Scannable = number(0.05, "first value of the entropy temperature", above=True)
     regulariser: str = choice(

@@ -26,6 +26,7 @@ from qdos_brax.high_level.skill_learning import FrozenSkills, SkillLearning
 from qdos_brax.high_level.warm_up import WarmUp
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
+from qdos_brax.nn.optim import running_mean
 from qdos_brax.population import health
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
@@ -38,6 +39,7 @@ class OnlinePhaseState(struct.PyTreeNode):
     Attributes:
         key: typed key.
         learners: networks and optimiser states.
+        played: what evaluations and the finished run play, the actor or its running mean.
         acting: environments, replay and counts.
         update: critic steps so far.
         healthy: False once a parameter stopped being finite; the member is frozen from then on.
@@ -46,6 +48,7 @@ class OnlinePhaseState(struct.PyTreeNode):
 
     key: jax.Array
     learners: Learners
+    played: Any
     acting: ActingState
     update: jax.Array
     healthy: jax.Array
@@ -116,8 +119,9 @@ class OnlinePhase(MemberPhase):
         state, constants = super().init(key, artifacts)
         fresh = state.learners.high_level
         given = jax.tree.map(jnp.array, artifacts.get(AGENT, to_state_dict(fresh)))  # copies: states are donated
-        learners = state.learners.replace(high_level=from_state_dict(fresh, given))
-        return state.replace(learners=learners), constants
+        high_level = from_state_dict(fresh, given)
+        played = jax.tree.map(jnp.array, self._high_level.actor_params(high_level))
+        return state.replace(learners=state.learners.replace(high_level=high_level), played=played), constants
 
     def chunk(self, state: OnlinePhaseState, constants: Any) -> tuple[OnlinePhaseState, dict[str, Any]]:
         """Make some iterations, and an evaluation when one is due (always after the last chunk)."""
@@ -153,8 +157,7 @@ class OnlinePhase(MemberPhase):
             learned, seen = state.learners.skills, state.acting.seen
             kept["skills"] = jax.vmap(self._skill_learning.final_skills)(learned, seen, kept["skills"])
         normaliser = self._normalise.repeated(state.update.shape[0])
-        actor = self._high_level.actor_params(state.learners.high_level)
-        return kept | {"actor": actor, "normaliser": normaliser, health.KEY: state.healthy}
+        return kept | {"actor": state.played, "normaliser": normaliser, health.KEY: state.healthy}
 
     def start_member(self, key: jax.Array, hyper: dict[str, jax.Array], shared: None) -> OnlinePhaseState:
         """Return fresh learners, an empty replay, environments at their starts."""
@@ -162,9 +165,11 @@ class OnlinePhase(MemberPhase):
         keys = Learners(high_level_key, bonus_key, labeller_key, skill_key)
         observation = jnp.zeros(self._high_level.observation_dim)
         row = Transition(observation, jnp.zeros(self._high_level.action_dim), jnp.zeros(()), jnp.zeros(()), observation)
+        learners = self.learning.init(keys, hyper)
         return OnlinePhaseState(
             key=key,
-            learners=self.learning.init(keys, hyper),
+            learners=learners,
+            played=self._high_level.actor_params(learners.high_level),
             acting=self._acting.start(env_key, row),
             update=jnp.zeros((), jnp.int32),
             healthy=jnp.ones((), bool),
@@ -186,7 +191,7 @@ class OnlinePhase(MemberPhase):
     ) -> tuple[OnlinePhaseState, dict[str, jax.Array]]:
         act_key, update_key, key = jax.random.split(state.key, 3)
         skills = self._skill_learning.training_skills(state.learners.skills, constants["skills"])
-        agent = self._agent(state.learners, skills, hyper)
+        agent = self._agent(self._high_level.actor_params(state.learners.high_level), skills, hyper)
         acting, newest, info = self._acting.step(state.acting, act_key, agent, constants["guide"], hyper)
         sources = Sources(acting.replay, data, constants["skills"], constants["labels"], hyper, acting.seen)
         learn = partial(self.learning.step, env_steps=acting.env_steps, sources=sources)
@@ -198,7 +203,9 @@ class OnlinePhase(MemberPhase):
         learners = jax.tree.map(lambda new, old: jnp.where(learns, new, old), learners, state.learners)
         learners, healthy = health.keep_finite(state.healthy, learners, state.learners)
         update = state.update + jnp.where(learns, self._num_envs * self._utd, 0)
-        state = state.replace(key=key, learners=learners, acting=acting, healthy=healthy, update=update)
+        actor = self._high_level.actor_params(learners.high_level)
+        played = running_mean(state.played, actor, hyper["high_level.actor_average"])
+        state = state.replace(key=key, learners=learners, played=played, acting=acting, healthy=healthy, update=update)
         return state, info | jax.tree.map(jnp.mean, losses)
 
     def _play_episodes(
@@ -206,10 +213,9 @@ class OnlinePhase(MemberPhase):
     ) -> tuple[OnlinePhaseState, Episodes]:
         key, episode_key = jax.random.split(state.key)
         skills = self._skill_learning.final_skills(state.learners.skills, state.acting.seen, constants["skills"])
-        agent = self._agent(state.learners, skills, hyper)
+        agent = self._agent(state.played, skills, hyper)
         episodes = evaluate(self._env, agent.choose, agent.play, episode_key, self._episodes, self._horizon)
         return state.replace(key=key, acting=with_first_goal(state.acting, episodes.success)), episodes
 
-    def _agent(self, learners: Learners, skills: Any, hyper: dict[str, jax.Array]) -> Agent:
-        actor, box = self._high_level.actor_params(learners.high_level), hyper["skills.latent_box"]
-        return Agent(self._normalise, self._low_level, self._high_level, box, skills, actor)
+    def _agent(self, actor: Any, skills: Any, hyper: dict[str, jax.Array]) -> Agent:
+        return Agent(self._normalise, self._low_level, self._high_level, hyper["skills.latent_box"], skills, actor)

@@ -26,3 +26,8 @@ def rate_schedule(name: str, steps: int) -> optax.Schedule:
 def polyak(target: Params, params: Params, rate: jax.Array | float) -> Params:
     """Return ``target`` moved towards ``params`` by ``rate`` of the way."""
     return jax.tree.map(lambda t, p: t + rate * (p - t), target, params)
+
+
+def running_mean(mean: Params, params: Params, share: jax.Array | float) -> Params:
+    """Return ``mean`` moved towards ``params`` by ``share`` of the way; exactly ``params`` if that is 1."""
+    return jax.tree.map(lambda m, p: (1 - share) * m + share * p, mean, params)

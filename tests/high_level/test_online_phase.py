@@ -17,6 +17,7 @@ from qdos_brax.labels.label_phase import LabelPhase
 from qdos_brax.labels.offline_reward import DataReward, MinimumReward, PredictedReward
 from qdos_brax.labels.reward_model import RewardModel
 from qdos_brax.labels.rnd import RND
+from qdos_brax.nn.optim import running_mean
 from qdos_brax.skills.low_level import TrajectorySkills
 from qdos_brax.skills.segment_weights import UniformWeights
 from qdos_brax.skills.skill_phase import SkillPhase
@@ -302,3 +303,28 @@ def test_bonus_and_reward_model_see_observations_as_they_are_told():
         np.testing.assert_allclose(
             reward.label(labels, row, 0.9)[0], model.predict(labels.params, seen, action)[0], rtol=1e-5
         )
+
+
+def short_run(plane, share):
+    """(learning actor, played actor) after 1,000 steps, and the learners, of one member."""
+    changes = {"high_level.env_steps": 1000, "high_level.warmup_env_steps": 200, "high_level.actor_average": share}
+    phase, artifacts, keys = online_phase(plane, point_config(**SKILLS, **changes))
+    state, _, artifacts = run_phase(phase, keys, artifacts)
+    return state.learners.high_level.actor, artifacts["actor"], state.learners
+
+
+def test_what_is_played_is_the_actor_or_its_running_mean(plane):
+    """The mean changes nothing that is learned; as slow as this it has hardly left where the actor began."""
+    actor, played, learners = short_run(plane, 1.0)
+    other, mean, same = short_run(plane, 1e-6)
+    assert jax.tree.all(jax.tree.map(np.array_equal, learners, same))
+    assert jax.tree.all(jax.tree.map(np.array_equal, actor, played))
+    moved = [np.abs(np.subtract(a, m)).max() for a, m in zip(*map(jax.tree.leaves, (other, mean)), strict=True)]
+    assert max(moved) > 0.01
+
+
+def test_running_mean_by_hand():
+    mean = {"w": jnp.array([1.0, jnp.float32(0.1)])}
+    params = {"w": jnp.array([2.0, jnp.float32(0.3)])}
+    np.testing.assert_allclose(running_mean(mean, params, 0.25)["w"], [1.25, 0.15], rtol=1e-6)
+    np.testing.assert_array_equal(running_mean(mean, params, 1.0)["w"], params["w"])
