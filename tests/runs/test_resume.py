@@ -134,7 +134,12 @@ def start(path: Path, sleep: float) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "tests.runs.toy", str(path), str(sleep)]
     root = Path(__file__).parents[2]
     env = {**os.environ, "PYTHONPATH": str(root)}  # on the device of the unbroken run, too
-    return subprocess.Popen(command, cwd=root, env=env, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, cwd=root, env=env, stderr=subprocess.PIPE, text=True, preexec_fn=_heed_hangups)
+
+
+def _heed_hangups() -> None:
+    """Undo ``nohup``, under which the tests themselves may have been started: a child ignores what its parent does."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def wait_for_rows(process: subprocess.Popen[str], path: Path, count: int) -> None:
