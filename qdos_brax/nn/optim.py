@@ -29,5 +29,8 @@ def polyak(target: Params, params: Params, rate: jax.Array | float) -> Params:
 
 
 def running_mean(mean: Params, params: Params, share: jax.Array | float) -> Params:
-    """Return ``mean`` moved towards ``params`` by ``share`` of the way; exactly ``params`` if that is 1."""
+    """Return ``mean`` moved towards ``params`` by ``share`` of the way.
+
+    It is exactly ``params`` if that is 1, which ``polyak`` misses by a last bit.
+    """
     return jax.tree.map(lambda m, p: (1 - share) * m + share * p, mean, params)
