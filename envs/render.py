@@ -128,16 +128,27 @@ def check_drawing() -> str:
     return type(gl).__module__.rpartition(".")[2]
 
 
+def find_way() -> str:
+    """Return the way to OpenGL that frames will be drawn by, without drawing: "egl", "osmesa" or "glfw".
+
+    The first call may take a second, for it tries the ways in processes of their own.
+
+    Raises:
+        NoOpenGL: ``MUJOCO_GL`` names no way, or is not set and none works.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if asked and asked not in _BY_MUJOCO_GL:
+        raise NoOpenGL(f"cannot draw: MUJOCO_GL is {asked!r}; unset it, or set it to egl, osmesa or glfw")
+    return _BY_MUJOCO_GL[asked] if asked else _headless_way()
+
+
 def _open_contexts(model: mujoco.MjModel, height: int, width: int) -> tuple[Any, mujoco.MjrContext]:
     """Return an OpenGL context, and in it the renderer's.
 
     Raises:
         NoOpenGL: no way works.
     """
-    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if asked and asked not in _BY_MUJOCO_GL:
-        raise NoOpenGL(f"cannot draw: MUJOCO_GL is {asked!r}; unset it, or set it to egl, osmesa or glfw")
-    way = _BY_MUJOCO_GL[asked] if asked else _headless_way()
+    way = find_way()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GLFW warns, and then fails

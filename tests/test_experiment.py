@@ -56,6 +56,13 @@ def test_a_process_that_ends_early_prints_nothing_of_what_it_loads_beside() -> N
     assert "Traceback" not in done.stderr, done.stderr
 
 
+def test_how_to_draw_is_found_beside_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = counted(monkeypatch, conclusion, "find_way")
+    monkeypatch.setattr(conclusion, "start_beside", lambda work, name: work())
+    conclusion.load_beside()
+    assert calls == [1]
+
+
 def test_alpha_is_printed_only_where_it_has_an_effect() -> None:
     assert conclusion.with_alpha("qdos", (0.1, 0.3)) == "alpha 0.1, 0.3, "
     assert conclusion.with_alpha("bc", 0.0) == ""

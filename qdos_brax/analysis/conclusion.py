@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from envs.render import find_way
 from qdos_brax.analysis.finished import TrainedRun, load_run
 from qdos_brax.config.methods import METHODS
 from qdos_brax.data import formats
@@ -25,11 +26,15 @@ _AT_THE_END = ("qdos_brax.report.write", "qdos_brax.analysis.inside")
 
 
 def load_beside() -> None:
-    """Load Matplotlib, SciPy's statistics and scikit-learn on a thread, while the run trains: 1.5 s for its end."""
+    """Load what the run's end needs on a thread, while the run trains.
+
+    That is Matplotlib, SciPy's statistics and scikit-learn (1.5 s), and how to draw on this machine (0.5 s).
+    """
 
     def load() -> None:
         for name in _AT_THE_END:
             importlib.import_module(name)
+        find_way()
 
     start_beside(load, "load")
 

@@ -17,8 +17,8 @@ from qdos_brax.analysis.film import EpisodeRunner, of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun, evaluation_key
 from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.data.device import DeviceData, Normaliser, to_device
-from qdos_brax.data.segments import window
+from qdos_brax.data.device import Normaliser
+from qdos_brax.data.segments import segment_starts
 from qdos_brax.files import write_arrays
 from qdos_brax.methods.low_level_kinds import make_low_level
 from qdos_brax.skills.temperature import member_temperature
@@ -96,24 +96,20 @@ class _Sample(NamedTuple):
 
     Attributes:
         dataset: the data.
-        data: the same data on the device.
         chosen: int[n], the indices of the segments among all segments.
         starts: int[n], their first rows.
     """
 
     dataset: Dataset
-    data: DeviceData
     chosen: np.ndarray
     starts: np.ndarray
 
 
 def _sample(trained: TrainedRun, dataset: Dataset) -> _Sample:
     """Draw random segments, the same ones for every method on the same data."""
-    normaliser = Normaliser(**jax.tree.map(lambda leaf: leaf[0], trained.artifacts["normaliser"]))  # all have the same
-    data, _ = to_device(dataset, trained.config.skills.horizon, normaliser)
-    total = data.starts.shape[0]
-    chosen = np.sort(np.random.default_rng(_SEED).choice(total, min(_SEGMENTS, total), replace=False))
-    return _Sample(dataset, data, chosen, np.asarray(data.starts)[chosen])
+    starts = segment_starts(dataset.ends, trained.config.skills.horizon)
+    chosen = np.sort(np.random.default_rng(_SEED).choice(len(starts), min(_SEGMENTS, len(starts)), replace=False))
+    return _Sample(dataset, chosen, starts[chosen])
 
 
 def _first_seeds(trained: TrainedRun) -> list[int]:
@@ -167,12 +163,13 @@ class _LatentView:
     """
 
     def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
-        horizon, data = trained.config.skills.horizon, sample.data
+        horizon, dataset = trained.config.skills.horizon, sample.dataset
+        normalise = Normaliser(**jax.tree.map(lambda leaf: leaf[0], trained.artifacts["normaliser"]))  # all have one
         self._trained = trained
-        self._segments = Segments(
-            *jax.jit(window, static_argnums=2)((data.observations, data.actions), sample.starts, horizon)
-        )
-        self._after = np.asarray(data.next_observations)[sample.starts + horizon - 1]
+        # Of the sample's rows alone: the whole data on the device a second time would be the run's peak of memory.
+        rows = sample.starts[:, None] + np.arange(horizon)
+        self._segments = Segments(normalise(dataset.observations[rows]), jnp.asarray(dataset.actions[rows]))
+        self._after = normalise(dataset.next_observations[rows[:, -1]])
         self._steps = min(_HELD * horizon, trained.env.episode_length)
         self._posterior = jax.jit(make_low_level(trained.config, trained.env).posterior)
         self._play = jax.jit(jax.vmap(self._path, in_axes=(None, None, 0)))
