@@ -29,16 +29,12 @@ class Episode(NamedTuple):
 
 def play_episode(trained: TrainedRun, runner: EpisodeRunner, member: int) -> Episode:
     """Return the episode that the evaluation of a member begins with."""
-    states: list[tuple[np.ndarray, ...]] = []
-    latents: list[np.ndarray] = []
+    moments = list(runner.episode(member))
     width = make_low_level(trained.config, trained.env).width  # a skill's first numbers are its latent
-    for state, decision in runner.episode(member):
-        if decision is not None and (len(states) - 1) % trained.config.skills.horizon == 0:
-            latents.append(np.asarray(decision)[:width])
-        physics = state.pipeline_state
-        states.append(tuple(map(np.asarray, (physics.qpos, physics.qvel, physics.extra, state.info["goal"]))))
-    *columns, goals = map(np.stack, zip(*states, strict=True))
-    return Episode(States(*columns), goals, np.stack(latents))
+    decisions = [moment.decision for moment in moments[1 :: trained.config.skills.horizon]]
+    columns = (np.stack([getattr(moment, name) for moment in moments]) for name in States._fields)
+    goals = np.stack([moment.goal for moment in moments])
+    return Episode(States(*columns), goals, np.stack(decisions)[:, :width])
 
 
 def measure_episode(env: Any, episode: Episode, horizon: int) -> dict[str, np.ndarray]:

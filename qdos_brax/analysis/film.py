@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 import envs
 from envs.render import NoOpenGL, Renderer, steps_per_second
 from qdos_brax.analysis.finished import TrainedRun, evaluation_key, load_run
 from qdos_brax.errors import UserError
 from qdos_brax.report.video import mp4
+
+_STEPS = 50  # of an episode that are played by one call, at least one decision's
 
 
 def film_run(run: Path, out: Path, height: int = 480) -> dict[str, float]:
@@ -39,11 +43,30 @@ def film_run(run: Path, out: Path, height: int = 480) -> dict[str, float]:
     except NoOpenGL as error:
         raise UserError(str(error)) from error
     with renderer, mp4(out, renderer.height, renderer.width, steps_per_second(env)) as write:
-        for state, _ in EpisodeRunner(trained).episode(0):
-            write(renderer.frame(state.pipeline_state.qpos, state.info["goal"]))
+        for moment in EpisodeRunner(trained).episode(0):
+            write(renderer.frame(moment.qpos, moment.goal))
             length += 1
-            episode_return += float(state.reward) if length else 0.0
-    return {"success": float(state.metrics["success"]), "return": episode_return, "length": length}
+            episode_return += float(moment.reward) if length else 0.0
+    return {"success": float(moment.success), "return": episode_return, "length": length}
+
+
+class Moment(NamedTuple):
+    """Hold what is seen of a state of an episode.
+
+    Attributes:
+        qpos, qvel, extra: the simulator's state.
+        goal: of the task.
+        reward, success: of the step that led to it.
+        decision: what was decided before that step; None for the start.
+    """
+
+    qpos: Any
+    qvel: Any
+    extra: Any
+    goal: Any
+    reward: Any
+    success: Any
+    decision: Any
 
 
 class EpisodeRunner:
@@ -56,25 +79,53 @@ class EpisodeRunner:
     def __init__(self, trained: TrainedRun) -> None:
         self._trained = trained
         self._reset = jax.jit(trained.env.reset)
-        self._choose = jax.jit(lambda artifacts, hyper, obs: trained.agent(artifacts, hyper).choose(obs))
-        self._step = jax.jit(self._step_once)
+        self._play = jax.jit(self._play_on)
 
-    def episode(self, member: int) -> Iterator[tuple[Any, jax.Array | None]]:
-        """Yield the states of a member's first episode, each with the decision that led to it (None for the start)."""
+    def episode(self, member: int) -> Iterator[Moment]:
+        """Yield the start of a member's first episode and what followed, arrays of NumPy."""
         learned = of_member(self._trained, member)
         state = self._reset(jax.random.split(evaluation_key(), 1)[0])
-        yield state, None
-        length = 0
+        yield jax.device_get(_seen(state, None))
         while not state.done:
-            if length % self._trained.config.skills.horizon == 0:
-                decision = self._choose(*learned, state.obs)
-            state = self._step(*learned, state, decision, length % self._trained.config.skills.horizon)
-            length += 1
-            yield state, decision
+            state, live, moments = self._play(*learned, state)
+            moments = jax.device_get(moments)
+            for index in range(np.count_nonzero(live)):
+                yield jax.tree.map(lambda leaf, index=index: leaf[index], moments)
 
-    def _step_once(self, artifacts: Any, hyper: Any, state: Any, decision: jax.Array, step: jax.Array) -> Any:
-        action = self._trained.agent(artifacts, hyper).play(state.obs, decision, step)
-        return self._trained.env.step(state, action)
+    def _play_on(self, artifacts: Any, hyper: Any, state: Any) -> tuple[Any, jax.Array, Moment]:
+        """Play some decisions by one program, for a call per step is slow: (state after, bool[T], moments[T]).
+
+        The episode goes on in the steps that are true; beyond its end nothing happens.
+        """
+        env, agent = self._trained.env, self._trained.agent(artifacts, hyper)
+        horizon = self._trained.config.skills.horizon
+
+        def decide(state: Any, _: None) -> tuple[Any, tuple[jax.Array, Moment]]:
+            decision = agent.choose(state.obs)
+
+            def step(state: Any, index: jax.Array) -> tuple[Any, tuple[jax.Array, Moment]]:
+                live = state.done < 0.5
+                action = agent.play(state.obs, decision, index)
+                after = jax.lax.cond(live, lambda: env.step(state, action), lambda: state)
+                return after, (live, _seen(after, decision))
+
+            return jax.lax.scan(step, state, jnp.arange(horizon))
+
+        state, played = jax.lax.scan(decide, state, None, length=max(1, _STEPS // horizon))
+        return state, *jax.tree.map(lambda leaf: jax.lax.collapse(leaf, 0, 2), played)
+
+
+def _seen(state: Any, decision: jax.Array | None) -> Moment:
+    physics = state.pipeline_state
+    return Moment(
+        qpos=physics.qpos,
+        qvel=physics.qvel,
+        extra=physics.extra,
+        goal=state.info["goal"],
+        reward=state.reward,
+        success=state.metrics["success"],
+        decision=decision,
+    )
 
 
 def on_mujoco_c(trained: TrainedRun) -> TrainedRun:

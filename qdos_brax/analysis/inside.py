@@ -164,7 +164,8 @@ class _LatentView:
 
     def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
         horizon, dataset = trained.config.skills.horizon, sample.dataset
-        normalise = Normaliser(**jax.tree.map(lambda leaf: leaf[0], trained.artifacts["normaliser"]))  # all have one
+        own = jax.tree.map(lambda leaf: np.asarray(leaf)[0], trained.artifacts["normaliser"])  # all members have one
+        normalise = Normaliser(**own)
         self._trained = trained
         # Of the sample's rows alone: the whole data on the device a second time would be the run's peak of memory.
         rows = sample.starts[:, None] + np.arange(horizon)

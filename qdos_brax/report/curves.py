@@ -134,8 +134,9 @@ def _draw_scan(axis: Axes, scan: Scan) -> None:
 def save_figure(figure: Figure, out: Path) -> None:
     """Write a figure to a file, as a whole or not at all, and free its memory."""
     try:
-        figure.draw_without_rendering()  # lays it out once, where savefig would twice
-        figure.set_layout_engine(None)
+        if engine := figure.get_layout_engine():
+            engine.execute(figure)  # once, where savefig lays it out twice, and draws it for each
+            figure.set_layout_engine(None)
         with replacing(out) as partial:
             figure.savefig(partial, dpi=120)
     finally:

@@ -6,16 +6,20 @@ import io
 import shlex
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import imageio_ffmpeg
 import jax
+import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import PIL.Image
 import pytest
 
 import envs
-from envs import render
+from envs import brax_base, render
+from envs.physics.base import PipelineState
 from qdos_brax.analysis import film, pictures, strip
 from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.commands import main as commands
@@ -74,6 +78,49 @@ def test_evaluate_films_the_first_episode(
         if t % 10 == 0:
             latent = agent.choose(state.obs)
         state = step(state, latent)
+
+
+class Counter:
+    """A task whose state counts its steps, adds up its actions and is done at ``end``."""
+
+    def __init__(self, end: int) -> None:
+        self.end = end
+
+    def reset(self, key: jax.Array) -> brax_base.State:
+        zeros = jnp.zeros(1)
+        physics = PipelineState(zeros, zeros, zeros[:0], jnp.zeros(0, jnp.int32), (), jnp.zeros((), jnp.int32))
+        done = jnp.zeros(())
+        return brax_base.State(physics, zeros, done, done, {"success": done}, {"goal": zeros})
+
+    def step(self, state: brax_base.State, action: jax.Array) -> brax_base.State:
+        physics = state.pipeline_state
+        physics = physics.replace(qpos=physics.qpos + 1, qvel=physics.qvel + action)
+        done = (physics.qpos[0] >= self.end).astype(jnp.float32)
+        return state.replace(
+            pipeline_state=physics, obs=physics.qpos, reward=physics.qpos[0], done=done, metrics={"success": done}
+        )
+
+
+@pytest.mark.parametrize("horizon", [1, 5, 60])
+@pytest.mark.parametrize("end", [7, 120])
+def test_an_episode_ends_where_it_is_done_and_decides_every_horizon(horizon: int, end: int) -> None:
+    agent = SimpleNamespace(choose=lambda obs: obs, play=lambda obs, decision, step: 1000 * decision + step)
+    trained: Any = SimpleNamespace(
+        env=Counter(end),
+        artifacts=(),
+        hyper={"a": jnp.zeros(1)},
+        agent=lambda *learned: agent,
+        config=SimpleNamespace(skills=SimpleNamespace(horizon=horizon)),
+    )
+    start, *moments = film.EpisodeRunner(trained).episode(0)
+    assert start.decision is None and start.qpos == 0
+    assert [moment.qpos[0] for moment in moments] == list(range(1, end + 1))
+    assert [moment.reward for moment in moments] == list(range(1, end + 1))
+    decided = [step - step % horizon for step in range(end)]  # each decision is the count it was made at
+    assert [moment.decision[0] for moment in moments] == decided
+    actions = np.diff([moment.qvel[0] for moment in (start, *moments)])
+    np.testing.assert_array_equal(actions, [1000 * at + step - at for step, at in enumerate(decided)])
+    assert [moment.success for moment in moments] == [0.0] * (end - 1) + [1.0]
 
 
 def test_the_evaluation_is_the_same_without_a_film(finished: Path) -> None:
