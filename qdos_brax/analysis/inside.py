@@ -164,13 +164,14 @@ class _LatentView:
 
     def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
         horizon, dataset = trained.config.skills.horizon, sample.dataset
-        own = jax.tree.map(lambda leaf: np.asarray(leaf)[0], trained.artifacts["normaliser"])  # all members have one
-        normalise = Normaliser(**own)
-        self._trained = trained
         # Of the sample's rows alone: the whole data on the device a second time would be the run's peak of memory.
         rows = sample.starts[:, None] + np.arange(horizon)
-        self._segments = Segments(normalise(dataset.observations[rows]), jnp.asarray(dataset.actions[rows]))
-        self._after = normalise(dataset.next_observations[rows[:, -1]])
+        taken: Any = (dataset.observations[rows], dataset.next_observations[rows[:, -1]])
+        # All members have one normaliser. In NumPy, for which nothing is compiled.
+        own = jax.tree.map(lambda leaf: np.asarray(leaf)[0], trained.artifacts["normaliser"])
+        observations, self._after = map(Normaliser(**own), taken)
+        self._trained = trained
+        self._segments = Segments(observations, jnp.asarray(dataset.actions[rows]))
         self._steps = min(_HELD * horizon, trained.env.episode_length)
         self._posterior = jax.jit(make_low_level(trained.config, trained.env).posterior)
         self._play = jax.jit(jax.vmap(self._path, in_axes=(None, None, 0)))
