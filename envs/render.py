@@ -123,9 +123,8 @@ def check_drawing() -> str:
     Raises:
         NoOpenGL: this machine cannot draw.
     """
-    gl, context = _open_contexts(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16)
-    _free(gl, context)
-    return type(gl).__module__.rpartition(".")[2]
+    _free(*_open_contexts(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16))
+    return find_way()
 
 
 def find_way() -> str:

@@ -97,19 +97,20 @@ class _Sample(NamedTuple):
     Attributes:
         dataset: the data.
         chosen: int[n], the indices of the segments among all segments.
-        starts: int[n], their first rows.
+        rows: int[n, H], their rows.
     """
 
     dataset: Dataset
     chosen: np.ndarray
-    starts: np.ndarray
+    rows: np.ndarray
 
 
 def _sample(trained: TrainedRun, dataset: Dataset) -> _Sample:
     """Draw random segments, the same ones for every method on the same data."""
-    starts = segment_starts(dataset.ends, trained.config.skills.horizon)
+    horizon = trained.config.skills.horizon
+    starts = segment_starts(dataset.ends, horizon)
     chosen = np.sort(np.random.default_rng(_SEED).choice(len(starts), min(_SEGMENTS, len(starts)), replace=False))
-    return _Sample(dataset, chosen, starts[chosen])
+    return _Sample(dataset, chosen, starts[chosen][:, None] + np.arange(horizon))
 
 
 def _first_seeds(trained: TrainedRun) -> list[int]:
@@ -131,8 +132,8 @@ def _place(env: Any) -> Arrays:
 
 def _truth(trained: TrainedRun, sample: _Sample) -> Arrays:
     """Return what is known of the segments without a learner."""
-    dataset, starts, horizon = sample.dataset, sample.starts, trained.config.skills.horizon
-    found: Arrays = {"return": dataset.rewards[starts[:, None] + np.arange(horizon)].sum(axis=1)}
+    dataset, starts, horizon = sample.dataset, sample.rows[:, 0], trained.config.skills.horizon
+    found: Arrays = {"return": dataset.rewards[sample.rows].sum(axis=1)}
     if dataset.qpos is not None:
         gain = quality.progress(trained.env, dataset, starts, horizon)
         if gain is not None:
@@ -163,9 +164,8 @@ class _LatentView:
     """
 
     def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
-        horizon, dataset = trained.config.skills.horizon, sample.dataset
+        horizon, dataset, rows = trained.config.skills.horizon, sample.dataset, sample.rows
         # Of the sample's rows alone: the whole data on the device a second time would be the run's peak of memory.
-        rows = sample.starts[:, None] + np.arange(horizon)
         taken: Any = (dataset.observations[rows], dataset.next_observations[rows[:, -1]])
         # All members have one normaliser. In NumPy, for which nothing is compiled.
         own = jax.tree.map(lambda leaf: np.asarray(leaf)[0], trained.artifacts["normaliser"])
