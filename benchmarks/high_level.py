@@ -20,11 +20,16 @@ from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import read_finished
 from qdos_brax.methods.build import bind_phases, build_context, build_phases
 from qdos_brax.population.members import Population
+from qdos_brax.population.phase import MemberPhase
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
 
 COLUMNS = ("env", "method", "settings", "seed", "env_steps", "eval_success", "eval_score", "first_goal_step", "seconds")
-AFTER_SKILLS = ("label", "online")
+
+
+def after_skills(phases: list[MemberPhase]) -> list[MemberPhase]:
+    """Return the phases behind the one that learns the skills: labels, what a high level begins as, online."""
+    return phases[[phase.name for phase in phases].index("skills") + 1 :]
 
 
 def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, Any]]:
@@ -35,7 +40,7 @@ def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, 
     members = members or list(range(len(everyone)))
     chosen = [everyone[member] for member in members]
     context = build_context(config, trained.env, dataset)
-    phases = [phase for phase in build_phases(context) if phase.name in AFTER_SKILLS]
+    phases = after_skills(build_phases(context))
     bind_phases(phases, Population(configs.population_hyper(config, chosen), 1, jax.local_devices()), context.data)
     kept = {name: value for name, value in trained.artifacts.items() if name not in ("actor", "normaliser")}
     artifacts = jax.tree.map(lambda x: x[np.asarray(members)], kept)
