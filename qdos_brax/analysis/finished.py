@@ -136,7 +136,7 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
 
     Returns:
         One dict per member: seed, alpha, and whatever else varies, success (0..1), return, length, episodes, and
-        score (0..1) where a task has one.
+        score (0..1) where a task has one, and for each part of a task the share of episodes at whose end it is done.
 
     Raises:
         UserError: it is no run folder, or the run has not finished.
@@ -157,6 +157,7 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
     }
     if result.score is not None:
         means["score"] = np.asarray(result.score).mean(axis=-1)
+    means |= {f"{name} done": np.mean(done, axis=-1) for name, done in (result.parts or {}).items()}
     return [
         {**member, **{name: float(value[index]) for name, value in means.items()}, "episodes": episodes}
         for index, member in enumerate(members)

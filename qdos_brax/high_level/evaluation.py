@@ -21,12 +21,14 @@ class Episodes(NamedTuple):
         episode_return: float[N], undiscounted.
         length: int[N], environment steps.
         score: float[N], the share of the task that was done by the end; None for tasks that are done or not.
+        parts: bool[N] by name, which parts of the task are done at the end; None for tasks without parts.
     """
 
     success: jax.Array
     episode_return: jax.Array
     length: jax.Array
     score: jax.Array | None = None
+    parts: dict[str, jax.Array] | None = None
 
 
 def evaluate(
@@ -67,17 +69,21 @@ def evaluate(
     start = jax.vmap(env.reset)(jax.random.split(key, episodes))
     zeros = jnp.zeros(episodes)
     first = Episodes(zeros, zeros, jnp.zeros(episodes, jnp.int32))
+    # A state stays as it was when its episode was over.
     state, totals = jax.lax.while_loop(going, body, (start, first))
-    return totals._replace(score=state.metrics.get("score"))  # a state stays as it was when its episode was over
+    parts = env.parts(state.pipeline_state) if hasattr(env, "parts") else None
+    return totals._replace(score=state.metrics.get("score"), parts=None if parts is None else dict(parts))
 
 
 def summary(episodes: Episodes) -> dict[str, np.ndarray]:
     """Return columns of metrics.csv, [members] each, of episodes[members, N]."""
     success = np.asarray(episodes.success)
     score = {} if episodes.score is None else {"eval/score": np.asarray(episodes.score).mean(axis=-1)}
+    parts = {f"eval/done/{name}": np.mean(done, axis=-1) for name, done in (episodes.parts or {}).items()}
     return score | {
         "eval/success": success.mean(axis=-1),
         "eval/return": np.asarray(episodes.episode_return).mean(axis=-1),
         "eval/length": np.asarray(episodes.length).mean(axis=-1),
         "eval/episodes": np.full(success.shape[0], success.shape[-1]),
+        **parts,
     }

@@ -24,6 +24,7 @@ from qdos_brax.analysis import film, pictures, strip
 from qdos_brax.analysis import finished as finished_runs
 from qdos_brax.commands import main as commands
 from qdos_brax.errors import UserError
+from qdos_brax.high_level.evaluation import Episodes
 from qdos_brax.report import picture
 from qdos_brax.report.video import mp4, webp
 from tests.report.folders import write_run
@@ -127,6 +128,16 @@ def test_the_evaluation_is_the_same_without_a_film(finished: Path) -> None:
     members = finished_runs.evaluate_run(finished, 2)
     assert [member["seed"] for member in members] == [0, 1]
     assert all((member["return"], member["length"], member["success"]) == (-CAP, CAP, 0) for member in members)
+    assert not [name for name in members[0] if name.endswith(" done")]  # a maze has no parts
+
+
+def test_the_evaluation_says_which_parts_of_a_task_are_done(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two episodes: a share per part."""
+    zeros, parts = jnp.zeros(2), {"kettle": jnp.array([True, False]), "microwave": jnp.array([False, False])}
+    episodes = Episodes(zeros, zeros, zeros, zeros, parts)
+    monkeypatch.setattr(finished_runs, "evaluate", lambda *_: episodes)
+    for member in finished_runs.evaluate_run(finished, 2):
+        assert (member["kettle done"], member["microwave done"]) == (0.5, 0)
 
 
 @pytest.mark.parametrize("height", [48, 51])

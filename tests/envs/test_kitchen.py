@@ -186,8 +186,10 @@ def test_an_evaluation_tells_the_share_of_the_four(env: Any, monkeypatch: pytest
     monkeypatch.setattr(env, "reset", lambda key: env.reset_to(qpos, qvel, key=key))
     found = evaluate(env, lambda obs: obs[:1], lambda obs, latent, step: jnp.zeros(9), jax.random.key(0), 2, 2)
     assert found.score is not None and found.score.tolist() == [0.75, 0.75]
-    members = type(found)(*(part[None] for part in found))
+    members = jax.tree.map(lambda x: x[None], found)
     assert summary(members)["eval/score"].tolist() == [0.75] and summary(members)["eval/success"].tolist() == [0]
+    done = {name: summary(members)[f"eval/done/{name}"].tolist() for name in env.subtasks}
+    assert done == {"microwave": [1], "kettle": [0], "bottom burner": [1], "light switch": [1]}
     assert "eval/score" not in summary(members._replace(score=None))
 
 

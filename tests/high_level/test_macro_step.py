@@ -96,6 +96,7 @@ def test_evaluation_plays_whole_episodes(goal, success, total, length):
     np.testing.assert_array_equal(episodes.episode_return, [total] * 3)
     np.testing.assert_array_equal(episodes.length, [length] * 3)
     assert episodes.score is None and "eval/score" not in summary(Episodes(*(x[None] for x in episodes[:3])))
+    assert episodes.parts is None
 
 
 class ScoredLine(Line):
@@ -116,7 +117,7 @@ def test_a_score_is_that_of_the_episodes_end(goal, score):
     env = ScoredLine(goal=goal, cap=20)
     episodes = evaluate(env, lambda obs: jnp.ones(1), lambda obs, z, step: z, jax.random.key(0), episodes=2, horizon=6)
     np.testing.assert_array_equal(episodes.score, [score] * 2)
-    of_members = Episodes(*(x[None] for x in episodes))
+    of_members = jax.tree.map(lambda x: x[None], episodes)
     assert summary(of_members)["eval/score"].tolist() == [score]
 
 
