@@ -13,6 +13,7 @@ from qdos_brax.report.study import Member, Setting, Study
 
 _ALL = "all tasks"
 _NONE = "-"
+_DONE = "eval/done/"  # columns of metrics.csv, one per part of the task
 _CsvRow = dict[str, str | float]
 
 
@@ -54,9 +55,11 @@ class Table:
 
 
 def tables(study: Study) -> list[Table]:
-    """Return table 1, its statistics over seeds, table 2, and what others published if that is shown."""
+    """Return table 1, its statistics over seeds, table 2, the parts of tasks that have some, and what others published
+    if that is shown.
+    """
     others = [_published_table(study)] if study.published else []
-    return [_success_table(study), _statistics_table(study), _first_goal_table(study), *others]
+    return [_success_table(study), _statistics_table(study), _first_goal_table(study), *_parts_tables(study), *others]
 
 
 def success_csv(study: Study) -> str:
@@ -130,6 +133,35 @@ def _first_goal_table(study: Study) -> Table:
     rows = [[setting.label, *(cell(setting, task) for task in study.tasks)] for setting in study.settings]
     note = "mean over the seeds that reached the goal; in brackets: how many did, of how many"
     return Table("Table 2. Environment steps to the first goal, mean ± std", ["method", *study.tasks], rows, note)
+
+
+def _parts_tables(study: Study) -> list[Table]:
+    """Return a table per task that has parts, a row per member: which of them its last evaluation ended with."""
+    found = []
+    for task in study.tasks:
+        of_task = [
+            (setting.label, member, _last_parts(member))
+            for setting in study.settings
+            for member in setting.members.get(task, [])
+        ]
+        names = list(dict.fromkeys(name for _, _, done in of_task for name in done))
+        rows = [
+            [label, str(member.seed), *(f"{100 * done[name]:.0f}" if name in done else _NONE for name in names)]
+            for label, member, done in of_task
+        ]
+        if names:
+            title = f"Parts of {task} that are done when an episode of the last evaluation ends (%)"
+            found.append(Table(title, ["method", "seed", *names], rows))
+    return found
+
+
+def _last_parts(member: Member) -> dict[str, float]:
+    """Return the share of episodes by part at the member's last evaluation; {} for a task without parts."""
+    for row in reversed(member.rows):
+        done = {key.removeprefix(_DONE): float(cell) for key, cell in row.items() if key.startswith(_DONE) and cell}
+        if done:
+            return done
+    return {}
 
 
 def _published_table(study: Study) -> Table:

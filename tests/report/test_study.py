@@ -118,6 +118,21 @@ def test_a_score_has_panels_of_its_own_where_there_is_one(tmp_path: Path) -> Non
     np.testing.assert_allclose(curve.mean, [0.5, 0.75, 1.0])
 
 
+def test_a_task_of_parts_has_a_table_of_them(tmp_path: Path) -> None:
+    """Two seeds: the last evaluation counts, and each misses another part."""
+    plain, parted = write_run(tmp_path / "a"), write_run(tmp_path / "b", success=[0, 0], env="kitchen-mixed-task1")
+    metrics = parted / "metrics.csv"
+    header, *lines = metrics.read_text().splitlines()
+    done = [",", ",", "0.25,0.25", "0.5,0.25"]  # two rows of the skills, which have none, and the earlier evaluations
+    cells = [*done, "1,0", *done, "0.05,0.9"]
+    rows = [f"{line},{cell}" for line, cell in zip(lines, cells, strict=True)]
+    metrics.write_text("\n".join([f"{header},eval/done/kettle,eval/done/light", *rows]) + "\n")
+    *_, parts = tables(read_study([plain, parted]))
+    assert parts.header == ["method", "seed", "kettle", "light"] and "kitchen-mixed-task1" in parts.title
+    assert parts.rows == [["qdos", "0", "100", "0"], ["qdos", "1", "5", "90"]]
+    assert len(tables(read_study([plain]))) == 3
+
+
 def test_scan_by_hand(tmp_path: Path) -> None:
     study = read_study([write_run(tmp_path / "a", success={0.3: [0.7, 0.9], 0.1: [0.5, None]})])
     (scan,) = scans(study)
