@@ -1,9 +1,9 @@
 """Keep the learning curves of finished runs: ``python benchmarks/curves.py RUN [RUN ..] --out results/curves.csv``.
 
 One row per evaluation of a member: task, method, preset, view, alpha, seed, environment steps, success, score (the
-share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole run, and
-the command, with the name alone of a data file. Rows of other runs that are in the file stay; rows of the same command
-are replaced.
+share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole run, the
+command, with the name alone of a data file, and for what learns offline alone the gradient steps so far. Rows of other
+runs that are in the file stay; rows of the same command are replaced.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from qdos_brax.report.study import Study, read_study
 
 COLUMNS = (
     *("env", "method", "preset", "view", "alpha", "seed"),
-    *("env_steps", "eval_success", "eval_score", "first_goal_step", "minutes_of_the_run", "command"),
+    *("env_steps", "eval_success", "eval_score", "first_goal_step", "minutes_of_the_run", "command", "update"),
 )
 
 
@@ -46,7 +46,8 @@ def rows_of(study: Study) -> list[dict[str, str]]:
                     measured = {"eval_success": f"{float(row['eval/success']):.3g}"}
                     if row.get("eval/score"):
                         measured["eval_score"] = f"{float(row['eval/score']):.3g}"
-                    found.append(about | own | measured | {"env_steps": row["env_steps"]})
+                    update = "" if row["env_steps"] else row["update"]
+                    found.append(about | own | measured | {"env_steps": row["env_steps"], "update": update})
     return found
 
 
