@@ -25,11 +25,12 @@ from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
 
 COLUMNS = ("env", "method", "settings", "seed", "env_steps", "eval_success", "eval_score", "first_goal_step", "seconds")
+KEPT = ("values", "skills", "guide")  # what these phases learned, as far as the method has them, is the run's own
 
 
 def after_skills(phases: list[MemberPhase]) -> list[MemberPhase]:
-    """Return the phases behind the one that learns the skills: labels, what a high level begins as, online."""
-    return phases[[phase.name for phase in phases].index("skills") + 1 :]
+    """Return the phases that make the high level: labels, what it begins as, online."""
+    return [phase for phase in phases if phase.name not in KEPT]
 
 
 def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, Any]]:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax.errors import FlaxError
 
 import envs
@@ -18,7 +17,7 @@ from qdos_brax.config.methods import METHODS
 from qdos_brax.data.device import Normaliser
 from qdos_brax.errors import UserError
 from qdos_brax.high_level.agent import Agent, Policy
-from qdos_brax.high_level.evaluation import evaluate
+from qdos_brax.high_level.evaluation import evaluate, summary
 from qdos_brax.methods.actor_critics import make_actor_critic
 from qdos_brax.methods.build import make_policy
 from qdos_brax.methods.low_level_kinds import make_low_level
@@ -150,14 +149,9 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
 
     program = Population(trained.hyper, trained.config.members_per_program).program(play)
     result = program(trained.artifacts, trained.hyper, evaluation_key())
-    means = {
-        "success": np.asarray(result.success).mean(axis=-1),
-        "return": np.asarray(result.episode_return).mean(axis=-1),
-        "length": np.asarray(result.length).mean(axis=-1),
-    }
-    if result.score is not None:
-        means["score"] = np.asarray(result.score).mean(axis=-1)
-    means |= {f"{name} done": np.mean(done, axis=-1) for name, done in (result.parts or {}).items()}
+    columns, names = summary(result), ("success", "return", "length", "score")
+    means = {name: columns[f"eval/{name}"] for name in names if f"eval/{name}" in columns}
+    means |= {f"{part} done": columns[f"eval/done/{part}"] for part in result.parts or {}}
     return [
         {**member, **{name: float(value[index]) for name, value in means.items()}, "episodes": episodes}
         for index, member in enumerate(members)
