@@ -9,7 +9,8 @@ Plays draws from the skill prior in the simulator, of the first member of each s
 - the share of states in which a skill has to get at something and a draw does: in mazes states at a wall, less than
   WALL away, from which a draw gets more than AWAY away; for an arm all states, where a draw moves a thing by MOVED;
 - random skills, one after the other: success and best score of whole episodes;
-- the oracle: success, score and steps of episodes in which the draw of most progress is played.
+- the oracle: success, score and steps of episodes in which the draw of most progress is played;
+- the search, which looks further ahead than one skill (``benchmarks/skill_search.py``): success, score, steps.
 
 In mazes progress is the true decrease of the shortest path to the goal, which training never sees, and an outcome is
 where the body got, as seen from its start. An arm has no such truth: progress is the decrease of the cost to go of the
@@ -31,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from regression import r2
 from scipy.spatial import KDTree
+from skill_search import searches
 from table import write_rows
 
 from envs.brax_base import State
@@ -263,25 +265,42 @@ def whole_episodes(skills: Skills, truth: Truth, episodes: int) -> dict[str, flo
     }
 
 
-def measure(run: Path, draws: int, states: int, episodes: int) -> list[dict[str, Any]]:
+def measure(run: Path, draws: int, states: int, episodes: int, number: int) -> list[dict[str, Any]]:
     """Return one row per member of a finished run."""
     trained, dataset = read_finished(RunFolder.open(run))
     trained = on_mujoco_c(trained)
     run_row = {"task": trained.config.env, "method": trained.config.method, "view": trained.config.skills.view}
     about = [run_row | settings for settings in configs.members(trained.config)]
-    return measure_members(trained, dataset, about, draws, states, episodes)
+    return measure_members(trained, dataset, about, draws, states, episodes, number)
 
 
 def measure_members(
-    trained: TrainedRun, dataset: Dataset, about: Sequence[dict[str, Any]], draws: int, states: int, episodes: int
+    trained: TrainedRun,
+    dataset: Dataset,
+    about: Sequence[dict[str, Any]],
+    draws: int,
+    states: int,
+    episodes: int = 0,
+    number: int = 0,
 ) -> list[dict[str, Any]]:
-    """Return one row per member, which begins with what is known ``about`` it; without ``episodes`` none are played."""
+    """Return one row per member, which begins with what is known ``about`` it.
+
+    Args:
+        trained: the run, on MuJoCo C.
+        dataset: its data.
+        about: for each member, the row's first columns.
+        draws: skills tried in each state.
+        states: logged states.
+        episodes: of random skills and of the oracle; 0 plays none.
+        number: of searches; 0 makes none.
+    """
     truth, rows = truth_of(trained, dataset), []
     for member, known in enumerate(about):
         started = time.perf_counter()
         skills = Skills(trained, member, draws)
         found = from_logged_states(skills, truth, dataset, states)
         found |= whole_episodes(skills, truth, episodes) if episodes else {}
+        found |= searches(Skills(trained, member, 1), truth.left, number) if number else {}
         rows.append(known | found | {"seconds": time.perf_counter() - started})
         print(
             "  ".join(f"{k} {v:.2f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()), flush=True
@@ -297,9 +316,10 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=16, help="skills drawn in each state (default 16)")
     parser.add_argument("--states", type=int, default=500, help="logged states (default 500)")
     parser.add_argument("--episodes", type=int, default=16, help="episodes of the oracle (default 16)")
+    parser.add_argument("--searches", type=int, default=4, help="searches of 64 episodes each (default 4)")
     args = parser.parse_args()
     prepare_jax()
-    rows = [row for run in args.runs for row in measure(run, args.draws, args.states, args.episodes)]
+    rows = [row for run in args.runs for row in measure(run, args.draws, args.states, args.episodes, args.searches)]
     write_rows(args.out, rows)
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import skill_search
 import skills
 
 from envs.body_frame import BodyFrame
+from envs.brax_base import State
 
 
 def state(qpos: Any, observation: Any = None) -> Any:
@@ -22,3 +25,47 @@ def test_an_outcome_counts_from_where_the_body_faces() -> None:
     before = state([[1.0, 1.0, 0.0]], jnp.array([[1.0, 1.0, 0.0, 0.5]]))
     after = state([[[2.0, 3.0, 0.0]], [[1.0, 1.0, 0.0]]])
     np.testing.assert_allclose(truth.outcome(before, after), [[[2.0, -1.0]], [[0.0, 0.0]]], atol=1e-6)
+
+
+class Walk:
+    """Skills of two steps that go one to the left or one to the right; success is ``far`` to the right."""
+
+    horizon = 2
+
+    def __init__(self, far: int, length: int) -> None:
+        self.far = far
+        self.env = SimpleNamespace(episode_length=length, reset=self._reset)
+
+    def _reset(self, key: jax.Array) -> State:
+        zero = jnp.zeros(())
+        return State(None, jnp.zeros(1), zero, zero, {"score": zero})
+
+    def play(self, states: State, key: jax.Array) -> dict[str, Any]:
+        place = states.obs[:, 0] + jax.random.rademacher(key, (len(states.obs),), jnp.float32)
+        end = states.replace(obs=place[:, None], metrics={"score": place / self.far})
+        success = place >= self.far
+        row = {"end": end, "success": success, "score": place / self.far, "steps": jnp.where(success, 1, 2)}
+        return jax.tree.map(lambda leaf: leaf[None], row)
+
+
+def test_those_behind_go_on_from_those_ahead() -> None:
+    """Score counts first, then what is left; all but the last quarter keep their state."""
+    score = np.array([0.5, 0.0, 0.25, 0.5, 0.25, 0.0, 0.0, 0.0])
+    left = np.array([4.0, 9.0, 7.0, 3.0, 5.0, 8.0, 6.0, 7.0])
+    np.testing.assert_array_equal(skill_search.selection(score, left, 0.25), [0, 0, 2, 3, 4, 3, 6, 7])
+
+
+def test_a_search_finds_what_chance_does_not() -> None:
+    """A walk of 60 steps is 30 to the right with a probability of 2^-60; selection gets there, and says when."""
+    walk = Walk(30, 120)
+    found = skill_search.searches(walk, lambda states: 30 - np.asarray(states.obs[:, 0]), 2)
+    assert found["search_success"] == 1 and found["search_score"] == 1
+    # No way is shorter than 30 skills, the last of which succeeds in its first step.
+    assert 59 <= found["search_steps"] <= 120 and found["search_steps"] % 2 == 1
+
+
+def test_a_search_without_success_tells_the_best_score() -> None:
+    """In 4 skills at most 4 of 30 can be gone."""
+    found = skill_search.search(Walk(30, 8), lambda states: 30 - np.asarray(states.obs[:, 0]), 0)
+    assert not found.success and np.isnan(found.steps)
+    assert found.score == np.float32(4 / 30)
