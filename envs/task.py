@@ -17,6 +17,7 @@ from envs.brax_base import Env, State
 from envs.families import TaskSpec
 from envs.physics.base import Engine, PipelineState
 from envs.scene import Scene, free_view
+from envs.things import Thing
 
 
 class SimulatorStates(Protocol):
@@ -94,7 +95,7 @@ class Task(Env, ABC):
 
     What not every task can do has a member all the same, which is None where the task cannot: ``position``,
     ``floor_map``, ``distance_left``, ``parts``, ``resting``, ``body_frame``. Maps, paths, reports and checks leave out
-    what is None.
+    what is None, and ``things`` is empty.
 
     Args:
         spec: which task.
@@ -106,6 +107,7 @@ class Task(Env, ABC):
         jump: distance that the first two numbers of an observation, a position then, never move in one control step;
             None where they are no position. Readers of data files find unmarked ends of episodes by it.
         body_frame: how the body sees its observations from where it is.
+        things: what rests in the scene until it is touched, independent of one another.
         metric_names: what ``state.metrics`` holds: "success", and "score" (the share of the task that is done) for a
             task that has parts.
         unfit: why known files of the same scene cannot be used, by their numbers per observation.
@@ -114,6 +116,7 @@ class Task(Env, ABC):
     distance_margin = 0.0
     jump: float | None = None
     body_frame: Frame | None = None
+    things: tuple[Thing, ...] = ()
     metric_names: tuple[str, ...] = ("success",)
     unfit: Mapping[int, str] = MappingProxyType({})
 

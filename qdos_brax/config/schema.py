@@ -13,7 +13,7 @@ from qdos_brax.config.baseline_groups import DiveOffConfig, FlowConfig, GuideCon
 from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig, TuningConfig
 from qdos_brax.config.rules import Rule, choice, count, field
 from qdos_brax.config.run_groups import RunConfig, ScanConfig
-from qdos_brax.config.skill_groups import DataConfig, SkillsConfig, ValuesConfig
+from qdos_brax.config.skill_groups import DataConfig, ExchangeConfig, SkillsConfig, ValuesConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Config:
     )
     out: str | None = field(None, "run folder; none names one under run.root", Rule("path"))
     data: DataConfig = DataConfig()
+    exchange: ExchangeConfig = ExchangeConfig()
     values: ValuesConfig = ValuesConfig()
     skills: SkillsConfig = SkillsConfig()
     labels: LabelsConfig = LabelsConfig()

@@ -31,6 +31,20 @@ class DataConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class ExchangeConfig:
+    """Configure counterfactual episodes of the data: things that nobody touched stand as another episode left them."""
+
+    share: float = number(
+        0.0,
+        "share of the episodes of which that is made (CoDA, Pitis et al. 2020); for tasks whose things are known: "
+        "kitchen",
+        high=1.0,
+        scan=False,
+    )
+    seed: int = count(0, "seed of the choice, apart from the learner's", low=0)
+
+
+@dataclasses.dataclass(frozen=True)
 class ValuesConfig:
     """Configure the values of states, from which the advantages of segments are computed."""
 

@@ -26,7 +26,12 @@ def unmet(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
         env: the task.
         config: the configuration to train with.
     """
-    return [*_segments(data, config), *_states(data, env, config), *_observations(data, config)]
+    return [
+        *_segments(data, config),
+        *_states(data, env, config),
+        *_things(data, env, config),
+        *_observations(data, config),
+    ]
 
 
 def remarks(data: Rows | Dataset, config: Config) -> list[str]:
@@ -63,14 +68,30 @@ def _states(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
     """Return a line if rollouts in the simulator have no states to start from."""
     if not METHODS[config.method].information or config.skills.mi_rollout != "physics":
         return []
-    needed = {"qpos": data.qpos, "qvel": data.qvel} | ({"infos/extra": data.extra} if env.extra_size else {})
-    missing = [name for name, array in needed.items() if array is None]
+    missing = _missing_states(data, env)
     if not missing:
         return []
     return [
-        f"no {' and '.join(missing)}, the simulator states from which {config.method} rolls out its skills: use "
+        f"no {missing}, the simulator states from which {config.method} rolls out its skills: use "
         "--set skills.mi_rollout=logged"
     ]
+
+
+def _things(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
+    """Return a line if there is nothing to exchange between episodes, or if it is not known how things stand."""
+    if config.exchange.share == 0:
+        return []
+    if not env.things:
+        return [f"exchange.share: {env.spec.family} has no things that rest until they are touched: leave it at 0"]
+    missing = _missing_states(data, env)
+    if not missing:
+        return []
+    return [f"no {missing}, the simulator states in which things are exchanged: use --set exchange.share=0"]
+
+
+def _missing_states(data: Rows | Dataset, env: Task) -> str:
+    needed = {"qpos": data.qpos, "qvel": data.qvel} | ({"infos/extra": data.extra} if env.extra_size else {})
+    return " and ".join(name for name, array in needed.items() if array is None)
 
 
 def _observations(data: Rows | Dataset, config: Config) -> list[str]:

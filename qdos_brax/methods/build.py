@@ -16,6 +16,7 @@ from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
+from qdos_brax.data.exchange import exchanged
 from qdos_brax.data.requirements import refuse, unmet
 from qdos_brax.high_level.actor_critic import AGENT, ActorCritic
 from qdos_brax.high_level.jump_start import JumpStart
@@ -58,6 +59,7 @@ def build_context(config: Config, env: Any, dataset: Dataset) -> BuildContext:
     configs.check_method(config)
     given = _given_skills(config, env)
     refuse(dataset.source, unmet(dataset, env, config))
+    dataset = exchanged(dataset, env, config.exchange.share, config.exchange.seed)
     data, normaliser = to_device(dataset, config.skills.horizon, None if given is None else given.normaliser)
     return BuildContext(config, METHODS[config.method], env, dataset, data, normaliser, given)
 
