@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Thing(NamedTuple):
-    """Say which numbers of a state belong to one thing, whatever the others do.
+    """Hold which numbers of a state belong to one thing, whatever the others do.
 
     Attributes:
         name: for messages.
