@@ -44,15 +44,15 @@ def exchanged(dataset: Dataset, env: Task, share: float, seed: int) -> Dataset:
     """
     if share == 0:
         return dataset
-    old = {name: getattr(dataset, name) for name in _NUMBERS}
+    old = {name: array for name in _NUMBERS if (array := getattr(dataset, name)) is not None}
     new = {name: array.copy() for name, array in old.items()}
     bounds, rng = dataset.episode_bounds, np.random.default_rng(seed)
     chosen = bounds[rng.random(len(bounds)) < share]
     givers = bounds[rng.integers(len(bounds), size=len(chosen)), 1] - 1
     for (first, stop), giver in zip(chosen, givers, strict=True):
         for thing in _exchangeable(old["qpos"][first:stop], old["qvel"][giver], env.things):
-            for name, kind in _NUMBERS.items():
-                numbers = list(getattr(thing, kind))
+            for name in new:
+                numbers = list(getattr(thing, _NUMBERS[name]))
                 # The state after a row is one in which the thing stands, too.
                 new[name][first:stop, numbers] = old[name.removeprefix("next_")][giver, numbers]
     moved = dataclasses.replace(dataset, **new)

@@ -17,6 +17,7 @@ from qdos_brax import config as configs
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.exchange import exchanged
 from qdos_brax.data.requirements import unmet
+from qdos_brax.methods.build import build_context
 from tests.point import PointEnv, point_dataset
 
 LENGTH = 4
@@ -30,7 +31,7 @@ def drawers() -> Any:
         done = states.extra.sum(axis=1)
         return (done - 2).astype(np.float32), (done < 2).astype(np.float32)
 
-    return SimpleNamespace(things=things, labels=labels)
+    return SimpleNamespace(things=things, labels=labels, extra_size=2)
 
 
 def episode(opens: int, giver_speed: float = 0.0) -> dict[str, np.ndarray]:
@@ -83,6 +84,13 @@ def test_two_drawers_are_open_together_though_no_episode_opens_both() -> None:
     for name in ("actions", "ends"):
         assert getattr(new, name) is getattr(data, name)
     np.testing.assert_array_equal(new.qvel, data.qvel)
+
+
+def test_all_that_learns_is_given_the_exchanged_data() -> None:
+    config = configs.replace(configs.Config(), **{"method": "bc", "skills.horizon": 1, "exchange.share": 1.0})
+    context = build_context(config, drawers(), dataset(*([episode(1), episode(2)] * 20)))
+    assert context.dataset.rewards.max() == 0
+    np.testing.assert_array_equal(context.data.rewards, context.dataset.rewards)
 
 
 def test_the_given_data_stays_and_a_share_of_0_is_that_data() -> None:
@@ -161,8 +169,7 @@ def test_a_task_without_things_and_data_without_states_are_one_line() -> None:
     config = configs.replace(configs.Config(), **{"method": "bc", "skills.horizon": 1, "exchange.share": 0.5})
     (line,) = unmet(point_dataset(8), plane, config)
     assert line == "exchange.share: antmaze has no things that rest until they are touched: leave it at 0"
-    kitchen = SimpleNamespace(things=drawers().things, extra_size=2)
     data = point_dataset(8)
-    (line,) = unmet(data, kitchen, config)
+    (line,) = unmet(data, drawers(), config)
     assert line == "no infos/extra, the simulator states in which things are exchanged: use --set exchange.share=0"
     assert unmet(data, PointEnv(), configs.replace(config, **{"exchange.share": 0.0})) == []
