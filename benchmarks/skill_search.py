@@ -2,9 +2,9 @@
 
 ``CROWD`` episodes that begin in one state play random skills. Every ``PERIOD`` skills those that are most behind go on
 from copies of those that are most ahead, as in multilevel splitting (Kahn and Harris 1951, "Estimation of particle
-transmission by random sampling"). Nothing is learned, and the task's own state says who is ahead, so that this is a
-ceiling and no method: what a search does not find, an agent will hardly do with these skills; what it finds, the skills
-can do, if with luck in the choice and in the noise.
+transmission by random sampling"). Nothing is learned, and the task's own state says who is ahead, so that this is no
+method but a lower bound: what a search finds, the skills can do, if with luck in the choice and in the noise. An agent
+may do more: it chooses among skills where a search draws from the prior.
 """
 
 from __future__ import annotations
