@@ -28,7 +28,7 @@ from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
 from qdos_brax.data import download, formats, origin, relocation
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.data.requirements import remarks
+from qdos_brax.data.requirements import refuse, remarks, unmet_by_task
 from qdos_brax.errors import UserError
 from qdos_brax.files import write_text
 from qdos_brax.methods.build import bind_phases, build_context, build_phases, check_skills, plan_members
@@ -88,6 +88,7 @@ def start(
     env = _make_env(first)
     for config in asked.values():
         check_skills(config, env)
+        refuse(config.env, unmet_by_task(env, config))
     if hosts.count > 1 and len(asked) > 1:
         raise UserError("--distributed shares the members of one run; give one method and one value of each size")
     if len(asked) == 1:

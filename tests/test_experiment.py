@@ -49,6 +49,15 @@ def test_a_scan_of_two_from_flags_to_page(
     assert "has finished already" in capsys.readouterr().out
 
 
+def test_a_task_without_things_is_refused_before_data_is_collected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("QDOS_DATA", str(tmp_path / "data"))
+    assert train_main(shlex.split(f"{TINY} --set exchange.share=0.5 --out {tmp_path / 'run'}")) == 2
+    assert "exchange.share: antmaze has no things" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_process_that_ends_early_prints_nothing_of_what_it_loads_beside() -> None:
     """A run that data is refused to ends with one line while modules for its report are still loading."""
     code = "from qdos_brax.analysis.conclusion import load_beside; load_beside()"

@@ -34,6 +34,13 @@ def unmet(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
     ]
 
 
+def unmet_by_task(env: Task, config: Config) -> list[str]:
+    """Return a line if the task itself lacks what ``config`` needs, so that no data of it would do."""
+    if config.exchange.share == 0 or env.things:
+        return []
+    return [f"exchange.share: {env.spec.family} has no things that rest until they are touched: leave it at 0"]
+
+
 def remarks(data: Rows | Dataset, config: Config) -> list[str]:
     """Return one line for each thing that training says of ``data`` and does without."""
     return [*data.notes, *([data.mismatch] if data.mismatch and config.skills.horizon == 1 else [])]
@@ -79,10 +86,8 @@ def _states(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
 
 def _things(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
     """Return a line if there is nothing to exchange between episodes, or if it is not known how things stand."""
-    if config.exchange.share == 0:
-        return []
-    if not env.things:
-        return [f"exchange.share: {env.spec.family} has no things that rest until they are touched: leave it at 0"]
+    if config.exchange.share == 0 or not env.things:
+        return unmet_by_task(env, config)
     missing = _missing_states(data, env)
     if not missing:
         return []
