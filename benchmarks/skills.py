@@ -316,7 +316,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=16, help="skills drawn in each state (default 16)")
     parser.add_argument("--states", type=int, default=500, help="logged states (default 500)")
     parser.add_argument("--episodes", type=int, default=16, help="episodes of the oracle (default 16)")
-    parser.add_argument("--searches", type=int, default=4, help="searches of 64 episodes each (default 4)")
+    parser.add_argument("--searches", type=int, default=2, help="searches of 64 episodes each (default 2)")
     args = parser.parse_args()
     prepare_jax()
     rows = [row for run in args.runs for row in measure(run, args.draws, args.states, args.episodes, args.searches)]
