@@ -32,7 +32,7 @@ class DataConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ExchangeConfig:
-    """Configure counterfactual episodes of the data: things that nobody touched stand as another episode left them."""
+    """Configure counterfactual episodes: things that nobody touched stand as another episode left them."""
 
     share: float = number(
         0.0,
