@@ -27,6 +27,7 @@ def unmet(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
         config: the configuration to train with.
     """
     return [
+        *unmet_by_task(env, config),
         *_segments(data, config),
         *_states(data, env, config),
         *_things(data, env, config),
@@ -85,10 +86,8 @@ def _states(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
 
 
 def _things(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
-    """Return a line if there is nothing to exchange between episodes, or if it is not known how things stand."""
-    if config.exchange.share == 0 or not env.things:
-        return unmet_by_task(env, config)
-    missing = _missing_states(data, env)
+    """Return a line if it is not known how the things stand that are exchanged between episodes."""
+    missing = _missing_states(data, env) if config.exchange.share > 0 and env.things else ""
     if not missing:
         return []
     return [f"no {missing}, the simulator states in which things are exchanged: use --set exchange.share=0"]
