@@ -25,6 +25,7 @@ from qdos_brax.data import formats, quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
+from qdos_brax.methods.learners_view import learners_dataset, learners_env
 from qdos_brax.methods.low_level_kinds import make_skill_model, value_phase
 from qdos_brax.population.members import Population
 from qdos_brax.runs.jax_setup import prepare_jax
@@ -171,7 +172,8 @@ def main() -> None:
     path = args.dataset or default_set.default_dataset(
         env, transitions=d.transitions, degraded_share=d.degraded_share, noise=d.noise, seed=d.seed, num_envs=d.num_envs
     )
-    dataset = formats.read(path, env)
+    logged, env = formats.read(path, env), learners_env(config, env)
+    dataset = learners_dataset(env, logged)
     data, _ = to_device(dataset, config.skills.horizon)
     found: dict[tuple[str, str], Scores] = {}
     for values in args.values.split(","):

@@ -24,6 +24,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import Normaliser, to_device
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.data.segments import window
+from qdos_brax.methods.learners_view import learners_dataset
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.skills.low_level import LowLevelPolicy
@@ -77,7 +78,8 @@ def main() -> None:
     artifacts, hyper = of_member(trained, 0)
     agent: Any = trained.agent(artifacts, hyper)
     horizon = trained.config.skills.horizon
-    for name, dataset in (("its own data", seen), ("held out", formats.read(args.dataset, trained.env))):
+    for name, rows in (("its own data", seen), ("held out", formats.read(args.dataset, trained.env.unwrapped))):
+        dataset = learners_dataset(trained.env, rows)
         found = errors(dataset, agent.normaliser, agent.low_level, agent.skills, horizon, args.segments)
         print(f"{args.run}, {name}: " + ", ".join(f"{kind} {error:.4f}" for kind, error in found.items()), flush=True)
 

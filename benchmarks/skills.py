@@ -45,6 +45,7 @@ from qdos_brax.analysis.film import of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import to_device
+from qdos_brax.methods.learners_view import learners_dataset
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.skills.graph_phase import graph_costs
@@ -294,6 +295,7 @@ def measure_members(
         episodes: of random skills and of the oracle; 0 plays none.
         number: of searches; 0 makes none.
     """
+    dataset = learners_dataset(trained.env, dataset)
     truth, rows = truth_of(trained, dataset), []
     for member, known in enumerate(about):
         started = time.perf_counter()

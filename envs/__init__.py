@@ -13,12 +13,13 @@ from envs.registry import ALIASES, FAMILIES, get_spec, list_tasks, make, registe
 
 if TYPE_CHECKING:
     from envs.task import Task
-    from envs.wrappers import AutoReset
+    from envs.wrappers import AutoReset, BesideBody
 
 __all__ = [
     "ALIASES",
     "FAMILIES",
     "AutoReset",
+    "BesideBody",
     "Family",
     "Task",
     "TaskSpec",
@@ -29,7 +30,7 @@ __all__ = [
     "register_family",
 ]
 
-_LOADED_LATER = {"AutoReset": "envs.wrappers", "Task": "envs.task"}
+_LOADED_LATER = {"AutoReset": "envs.wrappers", "BesideBody": "envs.wrappers", "Task": "envs.task"}
 
 
 def __getattr__(name: str) -> Any:

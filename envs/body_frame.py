@@ -29,6 +29,10 @@ class Frame(Protocol):
         """Return what is seen of ``observation[..., obs]`` from ``pose[..., pose_size]``."""
         ...
 
+    def beside(self, observation: jax.Array) -> jax.Array:
+        """Return float[..., k], what the body sees from its present pose and the observation does not say as it is."""
+        ...
+
 
 @dataclass(frozen=True)
 class BodyFrame:
@@ -81,6 +85,10 @@ class BodyFrame:
                 seen = _replace(seen, index, _turned_quaternion(_quaternion(observation, index), facing))
         gaps = [_pair(seen, index) - _pair(seen, self.place) for index in self.points]
         return jnp.concatenate([seen, *gaps], axis=-1)
+
+    def beside(self, observation: jax.Array) -> jax.Array:
+        """Return float[..., obs + 2 points], the observation in the body's present frame."""
+        return self.see(observation, self.pose(observation))
 
     def _facing(self, observation: jax.Array) -> jax.Array:
         """Return (cos yaw, sin yaw)[..., 2]."""

@@ -11,18 +11,8 @@ import jax.numpy as jnp
 from envs.brax_base import Env, State
 
 
-class AutoReset(Env):
-    """Start the next episode inside the step that ends one.
-
-    After a step with ``done``, ``obs``, ``pipeline_state`` and the episode's ``info`` are of a fresh reset, drawn from
-    a key that is never used twice, while reward, done, ``metrics`` and ``info["truncation"]`` are of the ended episode
-    and ``info["final_obs"]`` is its true last observation.
-
-    Physics that is no longer finite ends the episode too: ``metrics["nan"]`` is 1, the episode counts as truncated and
-    ``final_obs`` is the observation before the step, so that nothing non-finite reaches a learner.
-
-    Wraps a single environment: put ``jax.vmap`` around this class's reset and step.
-    """
+class _Wrapper(Env):
+    """Stand for another environment in all that a subclass does not change."""
 
     def __init__(self, env: Env) -> None:
         self.env = env
@@ -51,6 +41,20 @@ class AutoReset(Env):
     def unwrapped(self) -> Env:
         """Return the task."""
         return self.env.unwrapped
+
+
+class AutoReset(_Wrapper):
+    """Start the next episode inside the step that ends one.
+
+    After a step with ``done``, ``obs``, ``pipeline_state`` and the episode's ``info`` are of a fresh reset, drawn from
+    a key that is never used twice, while reward, done, ``metrics`` and ``info["truncation"]`` are of the ended episode
+    and ``info["final_obs"]`` is its true last observation.
+
+    Physics that is no longer finite ends the episode too: ``metrics["nan"]`` is 1, the episode counts as truncated and
+    ``final_obs`` is the observation before the step, so that nothing non-finite reaches a learner.
+
+    Wraps a single environment: put ``jax.vmap`` around this class's reset and step.
+    """
 
     def reset(self, rng: jax.Array, **options: Any) -> State:
         """Return the first episode's start; ``rng`` is a typed key.
@@ -85,6 +89,40 @@ class AutoReset(Env):
             done=done.astype(after.done.dtype),
             metrics=after.metrics | {"nan": bad.astype(jnp.float32)},
             info=info,
+        )
+
+
+class BesideBody(_Wrapper):
+    """Put beside each observation what the task's body sees from where it is (``Frame.beside``).
+
+    Args:
+        env: a task that offers a ``body_frame``.
+    """
+
+    def reset(self, rng: jax.Array) -> State:
+        """Return an episode's start."""
+        return self._seen(self.env.reset(rng))
+
+    def reset_to(self, *args: Any, **kwargs: Any) -> State:
+        """Return the state that the task's ``reset_to`` makes."""
+        return self._seen(self.env.reset_to(*args, **kwargs))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Return the state after one control step."""
+        return self._seen(self.env.step(state, action))
+
+    @property
+    def observation_size(self) -> int:
+        """Return the numbers per observation, those beside it included."""
+        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[-1]
+
+    def show(self, observation: jax.Array) -> jax.Array:
+        """Return float[..., obs + k], the task's ``observation[..., obs]`` and what stands beside it."""
+        return jnp.concatenate([observation, self.env.body_frame.beside(observation)], axis=-1)
+
+    def _seen(self, state: State) -> State:
+        return state.replace(
+            obs=self.show(state.obs), info=state.info | {"final_obs": self.show(state.info["final_obs"])}
         )
 
 

@@ -87,8 +87,8 @@ def start(
         configs.check_method(config)
     env = _make_env(first)
     for config in asked.values():
-        check_skills(config, env)
         refuse(config.env, unmet_by_task(env, config))
+        check_skills(config, env)
     if hosts.count > 1 and len(asked) > 1:
         raise UserError("--distributed shares the members of one run; give one method and one value of each size")
     if len(asked) == 1:

@@ -61,6 +61,11 @@ class HandFrame:
         tips, rotation, handles = self._places(observation)
         return jnp.concatenate([observation, tips - pose, rotation, *(place - tips for place in handles)], axis=-1)
 
+    def beside(self, observation: jax.Array) -> jax.Array:
+        """Return float[..., 9 + 3 handles], the hand's rotation and the handles as seen from the tips."""
+        tips, rotation, handles = self._places(observation)
+        return jnp.concatenate([rotation, *(place - tips for place in handles)], axis=-1)
+
     def _places(self, observation: jax.Array) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
         """Return the tips [..., 3], link 7's rotation [..., 9], and the handles' places, [..., 3] each."""
         qpos = observation[..., self._observed].reshape(-1, len(self._observed)).T

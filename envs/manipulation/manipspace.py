@@ -12,8 +12,16 @@ import numpy as np
 
 from envs.brax_base import State
 from envs.families import TaskSpec
-from envs.manipulation.manipspace_rig import CENTRE, FRAME_SKIP, PLACE_SCALE, ROBOT_JOINTS, ManipSpaceRig
+from envs.manipulation.manipspace_rig import (
+    CENTRE,
+    FRAME_SKIP,
+    PLACE_SCALE,
+    ROBOT_COLUMNS,
+    ROBOT_JOINTS,
+    ManipSpaceRig,
+)
 from envs.manipulation.ogbench_model import manip_space
+from envs.manipulation.table_frame import TableFrame
 from envs.physics import MujocoEngine, PipelineState
 from envs.physics.host_function import HostFunction
 from envs.scene import Scene, fixed_view
@@ -55,6 +63,9 @@ class ManipSpaceTask(Task):
     Args:
         spec: which task.
         rig_class: what connects the task to MuJoCo.
+
+    Attributes:
+        body_frame: the cubes as seen from the gripper.
     """
 
     distance_margin = 0.5
@@ -66,6 +77,7 @@ class ManipSpaceTask(Task):
         self.description = self.space.tasks[spec.task_id - 1]
         super().__init__(spec, MujocoEngine(self.space.stepped, self.rig, FRAME_SKIP), self.goal_of(self.description))
         self.cubes = len(self.start_of(self.description).cubes)
+        self.body_frame = TableFrame(self.cubes)
         self._arm_start = HostFunction(self._arm_starts, b"arm" + self.rig.identity() + self.space.arm_bounds.tobytes())
 
     @abstractmethod
@@ -155,7 +167,8 @@ class ManipSpaceTask(Task):
         """Return a line where cubes are at another place in the observations than in the states."""
         if rows.qpos is None:
             return []
-        seen = rows.observations[:, 19:22] - (rows.qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 3] - CENTRE) * PLACE_SCALE
+        cube = rows.observations[:, ROBOT_COLUMNS : ROBOT_COLUMNS + 3]
+        seen = cube - (rows.qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 3] - CENTRE) * PLACE_SCALE
         differ = np.abs(seen).max(axis=1, initial=0.0) > _DIFFERENCE
         return [f"qpos and observations disagree on the first cube in {count_rows(differ)}"] if differ.any() else []
 

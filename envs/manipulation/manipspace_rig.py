@@ -17,6 +17,8 @@ ARM_JOINTS, GRIPPER_JOINT, ROBOT_JOINTS = slice(0, 6), 6, 14
 CENTRE = np.array([0.425, 0.0, 0.0])
 """Place that positions in observations are relative to, in m; they are in units of 0.1 m."""
 PLACE_SCALE, GRIPPER_SCALE = 10.0, 3.0
+HAND_COLUMN, ROBOT_COLUMNS, CUBE_COLUMNS = 12, 19, 9
+"""In an observation: where the hand's place begins, how many numbers the robot has and, behind them, each cube."""
 
 # Numbers of the control law and of the observation are those of OGBench 1.2.2's ``ManipSpaceEnv``.
 _MOVE = np.array([0.05, 0.05, 0.05, 0.3, 1.0])  # m, m, m, rad and share of the gripper, of an action of 1
@@ -52,7 +54,7 @@ class ManipSpaceRig(Rig):
         self._cubes = [
             int(model.jnt_qposadr[i]) for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE
         ]
-        self.sensed_size = 19 + 9 * len(self._cubes)
+        self.sensed_size = ROBOT_COLUMNS + CUBE_COLUMNS * len(self._cubes)
 
     def identity(self) -> bytes:
         """Return the class and all numbers."""

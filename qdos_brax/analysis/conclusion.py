@@ -88,7 +88,7 @@ def read_finished(folder: RunFolder) -> tuple[TrainedRun, Dataset]:
         path = Path(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["path"])
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"cannot read from {folder.provenance} which data the run had ({error})") from error
-    return trained, formats.read(path, trained.env)
+    return trained, formats.read(path, trained.env.unwrapped)
 
 
 def conclude_comparison(path: Path, names: Sequence[str]) -> None:

@@ -20,6 +20,7 @@ from qdos_brax.high_level.agent import Agent, Policy
 from qdos_brax.high_level.evaluation import evaluate, summary
 from qdos_brax.methods.actor_critics import make_actor_critic
 from qdos_brax.methods.build import make_policy
+from qdos_brax.methods.learners_view import learners_env
 from qdos_brax.methods.low_level_kinds import make_low_level
 from qdos_brax.offline.flat_policy import FlatPolicy
 from qdos_brax.population.members import Population
@@ -34,7 +35,7 @@ class TrainedRun(NamedTuple):
 
     Attributes:
         config: the run's configuration.
-        env: its task.
+        env: its task, as its learners see it.
         artifacts: parameters with a leading member axis.
         hyper: what a scan may vary, by dotted key, with a leading member axis.
         agent: (artifacts, hyper) of one member -> what plays.
@@ -95,6 +96,7 @@ def trained_run(config: Config, env: Any, artifacts: Any) -> TrainedRun:
         env: its task.
         artifacts: what its phases learned, with a leading member axis; copied to one device from however many.
     """
+    env = learners_env(config, env)
     return TrainedRun(
         config,
         env,

@@ -20,6 +20,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import Normaliser
 from qdos_brax.data.segments import segment_starts
 from qdos_brax.files import write_arrays
+from qdos_brax.methods.learners_view import learners_observations
 from qdos_brax.methods.low_level_kinds import make_low_level
 from qdos_brax.skills.temperature import member_temperature
 from qdos_brax.skills.vae import Segments
@@ -166,7 +167,8 @@ class _LatentView:
     def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
         horizon, dataset, rows = trained.config.skills.horizon, sample.dataset, sample.rows
         # Of the sample's rows alone: the whole data on the device a second time would be the run's peak of memory.
-        taken: Any = (dataset.observations[rows], dataset.next_observations[rows[:, -1]])
+        logged = (dataset.observations[rows], dataset.next_observations[rows[:, -1]])
+        taken: Any = [learners_observations(trained.env, observations) for observations in logged]
         # All members have one normaliser. In NumPy, for which nothing is compiled.
         own = jax.tree.map(lambda leaf: np.asarray(leaf)[0], trained.artifacts["normaliser"])
         observations, self._after = map(Normaliser(**own), taken)

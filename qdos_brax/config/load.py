@@ -163,7 +163,7 @@ _AS_BEFORE = {
     ("labels", "latent"): "sample",
     ("labels", "inputs"): "normalised",
 }
-_GROUPS_AS_BEFORE = ("exchange", "scan", "flow", "tuning")  # left out if they have their defaults
+_GROUPS_AS_BEFORE = ("observation", "exchange", "scan", "flow", "tuning")  # left out if they have their defaults
 
 
 def config_hash(config: Config) -> str:

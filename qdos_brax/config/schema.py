@@ -13,7 +13,7 @@ from qdos_brax.config.baseline_groups import DiveOffConfig, FlowConfig, GuideCon
 from qdos_brax.config.online_groups import EvalConfig, HighLevelConfig, LabelsConfig, TuningConfig
 from qdos_brax.config.rules import Rule, choice, count, field
 from qdos_brax.config.run_groups import RunConfig, ScanConfig
-from qdos_brax.config.skill_groups import DataConfig, ExchangeConfig, SkillsConfig, ValuesConfig
+from qdos_brax.config.skill_groups import DataConfig, ExchangeConfig, ObservationConfig, SkillsConfig, ValuesConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Config:
     )
     out: str | None = field(None, "run folder; none names one under run.root", Rule("path"))
     data: DataConfig = DataConfig()
+    observation: ObservationConfig = ObservationConfig()
     exchange: ExchangeConfig = ExchangeConfig()
     values: ValuesConfig = ValuesConfig()
     skills: SkillsConfig = SkillsConfig()
@@ -84,7 +85,11 @@ def pretrain_keys() -> list[str]:
 
 def skill_keys(low_level: str) -> list[str]:
     """Return the dotted keys that say what skills are, for a kind of low-level policy (``methods.Method``)."""
-    groups = ("skills", *{"direction": ("hilbert",), "transition": ("diveoff",), "noise": ("flow",)}.get(low_level, ()))
+    groups = (
+        "observation",
+        "skills",
+        *{"direction": ("hilbert",), "transition": ("diveoff",), "noise": ("flow",)}.get(low_level, ()),
+    )
     return [key for key, _ in leaves(Config) if key.partition(".")[0] in groups]
 
 

@@ -31,6 +31,19 @@ class DataConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class ObservationConfig:
+    """Configure what all that is learned sees of an observation, in the data as in the simulator."""
+
+    view: str = choice(
+        "task",
+        "task (the observation as the task gives it) or body (beside it, what the task's body sees from where it is, "
+        "such as the gaps between a gripper and the cubes)",
+        "task",
+        "body",
+    )
+
+
+@dataclasses.dataclass(frozen=True)
 class ExchangeConfig:
     """Configure counterfactual episodes: things that nobody touched stand as another episode left them."""
 

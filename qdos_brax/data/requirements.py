@@ -37,9 +37,12 @@ def unmet(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
 
 def unmet_by_task(env: Task, config: Config) -> list[str]:
     """Return a line if the task itself lacks what ``config`` needs, so that no data of it would do."""
-    if config.exchange.share == 0 or env.things:
-        return []
-    return [f"exchange.share: {env.spec.family} has no things that rest until they are touched: leave it at 0"]
+    lacks = []
+    if config.observation.view == "body" and env.body_frame is None:
+        lacks.append(f"observation.view=body: {env.spec.family} offers no frame of a body: use observation.view=task")
+    if config.exchange.share > 0 and not env.things:
+        lacks.append(f"exchange.share: {env.spec.family} has no things that rest until they are touched: leave it at 0")
+    return lacks
 
 
 def remarks(data: Rows | Dataset, config: Config) -> list[str]:

@@ -33,6 +33,7 @@ from qdos_brax.labels.rnd import RND
 from qdos_brax.methods.actor_critics import make_actor_critic
 from qdos_brax.methods.context import BuildContext, SpaceSizes, offline_phase
 from qdos_brax.methods.given_skills import GivenSkills, read_skills
+from qdos_brax.methods.learners_view import learners_dataset, learners_env
 from qdos_brax.methods.low_level_kinds import make_low_level, skill_phases
 from qdos_brax.offline.actor_critic import OfflineActorCritic
 from qdos_brax.offline.bc import BC
@@ -57,9 +58,10 @@ def build_context(config: Config, env: Any, dataset: Dataset) -> BuildContext:
             skills are of another task or of other sizes.
     """
     configs.check_method(config)
-    given = _given_skills(config, env)
-    refuse(dataset.source, unmet(dataset, env, config))
-    dataset = exchanged(dataset, env, config.exchange.share, config.exchange.seed)
+    refuse(dataset.source, unmet(dataset, env.unwrapped, config))
+    dataset = exchanged(dataset, env.unwrapped, config.exchange.share, config.exchange.seed)
+    env = learners_env(config, env)
+    dataset, given = learners_dataset(env, dataset), _given_skills(config, env)
     data, normaliser = to_device(dataset, config.skills.horizon, None if given is None else given.normaliser)
     return BuildContext(config, METHODS[config.method], env, dataset, data, normaliser, given)
 
@@ -70,7 +72,7 @@ def check_skills(config: Config, env: Any) -> None:
     Raises:
         UserError: as ``read_skills``.
     """
-    _given_skills(config, env)
+    _given_skills(config, learners_env(config, env))
 
 
 def _given_skills(config: Config, env: Any) -> GivenSkills | None:

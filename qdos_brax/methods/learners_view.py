@@ -1,0 +1,34 @@
+"""What learners see of a task: its observations, or beside them what its body sees; the same in data and simulator."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+import envs
+from qdos_brax.config import Config
+from qdos_brax.data.dataset import Dataset
+
+
+def learners_env(config: Config, env: Any) -> Any:
+    """Return a task as its learners see it (``observation.view``).
+
+    Args:
+        config: the run's configuration.
+        env: the task, which offers that view, or what this function made of it.
+    """
+    return env if config.observation.view == "task" else envs.BesideBody(env.unwrapped)
+
+
+def learners_dataset(env: Any, dataset: Dataset) -> Dataset:
+    """Return the data of a task as the learners of ``env``, a ``learners_env``, see it."""
+    seen = {name: learners_observations(env, getattr(dataset, name)) for name in ("observations", "next_observations")}
+    return dataclasses.replace(dataset, **seen)
+
+
+def learners_observations(env: Any, observations: np.ndarray) -> np.ndarray:
+    """Return observations[..., obs] of the data as the learners of ``env``, a ``learners_env``, see them."""
+    return np.asarray(jax.jit(env.show)(observations)) if isinstance(env, envs.BesideBody) else observations
