@@ -154,8 +154,8 @@ def _spec(env: str) -> envs.TaskSpec:
 
 
 def _preset_layers(name: str, family: str, variant: str | None, low_level: str) -> list[Layer]:
-    """Return a preset's values, those of its sections over them; a family's section may have ``low_level`` again, and
-    over that ``variants``.
+    """Return a preset's values, those of its sections over them; a family's section may have ``variants``, and over
+    them ``low_level`` again, since how often a method decides weighs more than which of the family's tasks it plays.
     """
     if name not in presets():
         raise UserError(f"unknown preset {name!r}{nearest(name, presets())}; there are {', '.join(presets())}")
@@ -170,9 +170,10 @@ def _preset_layers(name: str, family: str, variant: str | None, low_level: str) 
         of_variant = _take_section(of_family, "variants", known, path)
         of_low_level = _take_section(of_family, "low_level", kinds, path)
         title = f"{title}, section families.{family}"
-        layers += [(title, of_family), (f"{title}.low_level.{low_level}", of_low_level.get(low_level))]
+        layers.append((title, of_family))
         if variant is not None:
             layers.append((f"{title}.variants.{variant}", of_variant.get(variant)))
+        layers.append((f"{title}.low_level.{low_level}", of_low_level.get(low_level)))
     return [Layer(title, known_keys(flat(part), str(path))) for title, part in layers if part]
 
 

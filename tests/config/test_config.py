@@ -93,8 +93,9 @@ families:
     assert (config.high_level.discount, flat.high_level.discount) == (0.8, 0.7)
     assert load_config("antsoccer", "tiny", {"method": "explore"}).high_level.discount == 0.9
     assert flat.labels.rnd_coefficient == 1.0  # --set over method
-    # A variant over its family, for all of its tasks.
+    # A variant over its family, for all of its tasks; over it the family's for the low-level policy.
     assert load_config("antmaze-medium-task3", "tiny").high_level.discount == 0.6
+    assert load_config("antmaze-medium", "tiny", {"method": "explore"}).high_level.discount == 0.7
     assert load_config("antmaze-large", "tiny").high_level.discount == 0.8
     (tmp_path / "presets" / "tiny.yaml").write_text(preset.replace("medium", "medum"))
     with pytest.raises(UserError, match="unknown entry 'medum' in variants, did you mean 'medium'"):
