@@ -58,8 +58,8 @@ def build_context(config: Config, env: Any, dataset: Dataset) -> BuildContext:
             skills are of another task or of other sizes.
     """
     configs.check_method(config)
-    refuse(dataset.source, unmet(dataset, env.unwrapped, config))
-    dataset = exchanged(dataset, env.unwrapped, config.exchange.share, config.exchange.seed)
+    refuse(dataset.source, unmet(dataset, env, config))
+    dataset = exchanged(dataset, env, config.exchange.share, config.exchange.seed)
     env = learners_env(config, env)
     dataset, given = learners_dataset(env, dataset), _given_skills(config, env)
     data, normaliser = to_device(dataset, config.skills.horizon, None if given is None else given.normaliser)
