@@ -2,8 +2,9 @@
 
 One row per evaluation of a member: task, method, preset, view, alpha, seed, environment steps, success, score (the
 share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole run, the
-command, with the name alone of a data file, and for what learns offline alone the gradient steps so far. Rows of other
-runs that are in the file stay; rows of the same command are replaced.
+command, with the name alone of a data file, for what learns offline alone the gradient steps so far, and what all that
+learns sees (``observation.view``; "view" is that of the skills). Rows of other runs that are in the file stay; rows of the
+same command are replaced.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from qdos_brax.report.study import Study, read_study
 COLUMNS = (
     *("env", "method", "preset", "view", "alpha", "seed"),
     *("env_steps", "eval_success", "eval_score", "first_goal_step", "minutes_of_the_run", "command", "update"),
+    "observation_view",
 )
 
 
@@ -34,6 +36,7 @@ def rows_of(study: Study) -> list[dict[str, str]]:
         about = {
             "preset": str(run.summary["preset"]),
             "view": run.config.skills.view,
+            "observation_view": run.config.observation.view,
             "minutes_of_the_run": f"{run.summary['wall_seconds']['total'] / 60:.1f}",
             "command": " ".join(["python", "train.py", *kept[1:]]),
         }
