@@ -99,9 +99,9 @@ class BesideBody(_Wrapper):
         env: a task that offers a ``body_frame``.
     """
 
-    def reset(self, rng: jax.Array) -> State:
-        """Return an episode's start."""
-        return self._seen(self.env.reset(rng))
+    def reset(self, rng: jax.Array, **options: Any) -> State:
+        """Return an episode's start; ``options`` go to the task's reset."""
+        return self._seen(self.env.reset(rng, **options))
 
     def reset_to(self, *args: Any, **kwargs: Any) -> State:
         """Return the state that the task's ``reset_to`` makes."""
