@@ -1,10 +1,10 @@
 """Keep the learning curves of finished runs: ``python benchmarks/curves.py RUN [RUN ..] --out results/curves.csv``.
 
-One row per evaluation of a member: task, method, preset, view, alpha, seed, environment steps, success, score (the
-share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole run, the
-command, with the name alone of a data file, for what learns offline alone the gradient steps so far, and what all that
-learns sees (``observation.view``; "view" is that of the skills). Rows of other runs that are in the file stay; rows of the
-same command are replaced.
+One row per evaluation of a member: task, method, preset, view of the skills, alpha, seed, environment steps, success,
+score (the share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole
+run, the command, with the name alone of a data file, for what learns offline alone the gradient steps so far, and the
+view of all that learns (``observation.view``). Rows of other runs that are in the file stay; rows of the same command
+are replaced.
 """
 
 from __future__ import annotations
