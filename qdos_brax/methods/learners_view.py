@@ -25,8 +25,11 @@ def learners_env(config: Config, env: Any) -> Any:
 
 def learners_dataset(env: Any, dataset: Dataset) -> Dataset:
     """Return the data of a task as the learners of ``env``, a ``learners_env``, see it."""
-    seen = {name: learners_observations(env, getattr(dataset, name)) for name in ("observations", "next_observations")}
-    return dataclasses.replace(dataset, **seen)
+    return dataclasses.replace(
+        dataset,
+        observations=learners_observations(env, dataset.observations),
+        next_observations=learners_observations(env, dataset.next_observations),
+    )
 
 
 def learners_observations(env: Any, observations: np.ndarray) -> np.ndarray:
