@@ -121,9 +121,9 @@ class BesideBody(_Wrapper):
         return jnp.concatenate([observation, self.env.body_frame.beside(observation)], axis=-1)
 
     def _seen(self, state: State) -> State:
-        return state.replace(
-            obs=self.show(state.obs), info=state.info | {"final_obs": self.show(state.info["final_obs"])}
-        )
+        # Once: of a task, which nothing resets, final_obs is obs.
+        seen = self.show(state.obs)
+        return state.replace(obs=seen, info=state.info | {"final_obs": seen})
 
 
 def _when_any(reset: Callable[[jax.Array], State]) -> Callable[[jax.Array, jax.Array], State]:

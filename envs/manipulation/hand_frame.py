@@ -58,13 +58,17 @@ class HandFrame:
         Behind the observation stand the way of the tips since then, the hand's rotation, and where each of ``HANDLES``
         is as seen from the tips.
         """
-        tips, rotation, handles = self._places(observation)
-        return jnp.concatenate([observation, tips - pose, rotation, *(place - tips for place in handles)], axis=-1)
+        tips, beside = self._look(observation)
+        return jnp.concatenate([observation, tips - pose, beside], axis=-1)
 
     def beside(self, observation: jax.Array) -> jax.Array:
         """Return float[..., 9 + 3 handles], the hand's rotation and the handles as seen from the tips."""
+        return self._look(observation)[1]
+
+    def _look(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the tips [..., 3], and what ``beside`` returns."""
         tips, rotation, handles = self._places(observation)
-        return jnp.concatenate([rotation, *(place - tips for place in handles)], axis=-1)
+        return tips, jnp.concatenate([rotation, *(place - tips for place in handles)], axis=-1)
 
     def _places(self, observation: jax.Array) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
         """Return the tips [..., 3], link 7's rotation [..., 9], and the handles' places, [..., 3] each."""

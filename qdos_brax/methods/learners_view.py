@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -34,4 +35,9 @@ def learners_dataset(env: Any, dataset: Dataset) -> Dataset:
 
 def learners_observations(env: Any, observations: np.ndarray) -> np.ndarray:
     """Return observations[..., obs] of the data as the learners of ``env``, a ``learners_env``, see them."""
-    return np.asarray(jax.jit(env.show)(observations)) if isinstance(env, envs.BesideBody) else observations
+    return np.asarray(_shown(env, observations)) if isinstance(env, envs.BesideBody) else observations
+
+
+@partial(jax.jit, static_argnums=0)  # of this module: a jitted ``env.show`` would be compiled anew at every call
+def _shown(env: envs.BesideBody, observations: jax.Array) -> jax.Array:
+    return env.show(observations)

@@ -10,7 +10,7 @@ import numpy as np
 
 from envs.manipulation import poses
 from envs.manipulation.manipspace import CUBE, ManipSpaceTask
-from envs.manipulation.manipspace_rig import CENTRE, GRIPPER_SCALE, PLACE_SCALE, ROBOT_JOINTS
+from envs.manipulation.manipspace_rig import CENTRE, GRIPPER_SCALE, HAND_COLUMN, PLACE_SCALE, ROBOT_JOINTS
 from envs.manipulation.scene_rig import SLIDES
 from qdos_brax.collection.scripted.demonstrator import SimStates
 
@@ -163,7 +163,7 @@ class TableReader:
     def read(self, states: SimStates) -> list[TableView]:
         """Return the table of each simulation."""
         sensed = states.sensed.astype(np.float64)
-        hands = sensed[:, 12:15] / PLACE_SCALE + CENTRE
+        hands = sensed[:, HAND_COLUMN : HAND_COLUMN + 3] / PLACE_SCALE + CENTRE
         yaws, grips = np.arctan2(sensed[:, 16], sensed[:, 15]), sensed[:, 17] / GRIPPER_SCALE
         last = ROBOT_JOINTS + CUBE * self._cubes
         cubes = states.qpos[:, ROBOT_JOINTS:last].reshape(len(hands), self._cubes, CUBE)
