@@ -2,9 +2,9 @@
 
 One row per evaluation of a member: task, method, preset, view of the skills, alpha, seed, environment steps, success,
 score (the share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole
-run, the command, with the name alone of a data file, for what learns offline alone the gradient steps so far, and the
-view of all that learns (``observation.view``). Rows of other runs that are in the file stay; rows of the same command
-are replaced.
+run, the command, with the name alone of a data file, for what learns offline alone the gradient steps so far, the
+view of all that learns (``observation.view``), and the steps of a skill. Rows of other runs that are in the file stay;
+rows of the same command and steps are replaced (a preset may have had others).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from qdos_brax.report.study import Study, read_study
 COLUMNS = (
     *("env", "method", "preset", "view", "alpha", "seed"),
     *("env_steps", "eval_success", "eval_score", "first_goal_step", "minutes_of_the_run", "command", "update"),
-    "observation_view",
+    *("observation_view", "horizon"),
 )
 
 
@@ -37,6 +37,7 @@ def rows_of(study: Study) -> list[dict[str, str]]:
             "preset": str(run.summary["preset"]),
             "view": run.config.skills.view,
             "observation_view": run.config.observation.view,
+            "horizon": str(run.config.skills.horizon),
             "minutes_of_the_run": f"{run.summary['wall_seconds']['total'] / 60:.1f}",
             "command": " ".join(["python", "train.py", *kept[1:]]),
         }
@@ -62,9 +63,10 @@ def main() -> None:
     args = parser.parse_args()
     new = rows_of(read_study(args.runs))
     known: list[dict[str, str]] = []
+    replaced = {(row["command"], row["horizon"]) for row in new}
     if args.out.exists():
         with args.out.open(encoding="utf-8", newline="") as file:
-            known = [row for row in csv.DictReader(file) if row["command"] not in {row["command"] for row in new}]
+            known = [row for row in csv.DictReader(file) if (row["command"], row.get("horizon", "")) not in replaced]
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
