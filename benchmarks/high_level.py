@@ -2,7 +2,8 @@
 
 A setting of the high level is compared with another one on the same skills and labels, without learning those again:
 the phases after the skills run with the run's configuration and the ``--set`` of the command line. Prints each
-evaluation; the CSV gets one row per member and evaluation.
+evaluation; the CSV gets one row per member and evaluation. Settings of what stays, such as how skills were learned, are
+refused: they would change nothing.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ import numpy as np
 
 from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import read_finished
+from qdos_brax.config.methods import METHODS
+from qdos_brax.config.schema import skill_keys
+from qdos_brax.errors import UserError
 from qdos_brax.methods.build import bind_phases, build_context, build_phases
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
@@ -26,6 +30,9 @@ from qdos_brax.runs.jax_setup import prepare_jax
 
 COLUMNS = ("env", "method", "settings", "seed", "env_steps", "eval_success", "eval_score", "first_goal_step", "seconds")
 KEPT = ("values", "skills", "guide")  # what these phases learned, as far as the method has them, is the run's own
+# Groups of settings that only they, or the data, read; those of skills depend on the method.
+BEFORE = ("data", "exchange", "values", "guide")
+PLAYED = "skills.latent_box"  # how the high level plays skills, which is its own choice
 
 
 def after_skills(phases: list[MemberPhase]) -> list[MemberPhase]:
@@ -33,9 +40,22 @@ def after_skills(phases: list[MemberPhase]) -> list[MemberPhase]:
     return [phase for phase in phases if phase.name not in KEPT]
 
 
+def check_settings(method: str, settings: list[str]) -> None:
+    """Refuse settings of what stays as the run has it.
+
+    Raises:
+        UserError: a setting would change nothing.
+    """
+    learned = set(skill_keys(METHODS[method].low_level)) - {PLAYED}
+    for key in (text.partition("=")[0] for text in settings):
+        if key in learned or key.partition(".")[0] in BEFORE:
+            raise UserError(f"{key} would change nothing: data and skills stay those of the run; give it to train.py")
+
+
 def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, Any]]:
     """Return a row per member and evaluation."""
     trained, dataset = read_finished(RunFolder.open(str(run)))
+    check_settings(trained.config.method, settings)
     config = configs.replace(trained.config, **dict(text.split("=", 1) for text in settings))
     everyone = configs.members(config)
     members = members or list(range(len(everyone)))
@@ -93,7 +113,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="CSV file to add the rows to")
     args = parser.parse_args()
     prepare_jax()
-    rows = train(args.run, args.members, args.settings)
+    try:
+        rows = train(args.run, args.members, args.settings)
+    except UserError as error:
+        parser.error(str(error))
     if args.out:
         fresh = not args.out.exists()
         with args.out.open("a", encoding="utf-8", newline="") as file:

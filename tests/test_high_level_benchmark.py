@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import pytest
+
 from benchmarks import high_level
+from qdos_brax.errors import UserError
 
 
 def names(*every: str) -> list[str]:
@@ -20,3 +23,16 @@ def test_all_that_comes_after_the_skills_is_trained() -> None:
 def test_a_method_without_skills_and_one_with_a_guide_are_trained_too() -> None:
     assert names("label", "online") == ["label", "online"]
     assert names("guide", "label", "online") == ["label", "online"]
+
+
+@pytest.mark.parametrize("key", ["observation.view", "skills.horizon", "values.kind", "exchange.share", "guide.hidden"])
+def test_a_setting_of_what_stays_is_refused(key: str) -> None:
+    with pytest.raises(UserError, match=f"{key} would change nothing"):
+        high_level.check_settings("qdos", ["high_level.utd=4", f"{key}=1"])
+
+
+def test_what_the_high_level_reads_may_change() -> None:
+    """A flow is what a noise policy's skills are, and how long a warm start of the others takes."""
+    high_level.check_settings("qdos", ["skills.latent_box=1", "labels.offline_reward=data", "flow.updates=9"])
+    with pytest.raises(UserError, match=r"flow\.updates"):
+        high_level.check_settings("dsrl", ["flow.updates=9"])
