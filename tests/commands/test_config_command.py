@@ -40,7 +40,7 @@ def test_a_key_shows_every_layer_that_set_it(capsys: pytest.CaptureFixture[str])
         "    accepts number, at least 0 and at most 1; a list makes a scan",
         "    0.99 in default",
         "    0.995 in configs/antsoccer.yaml",
-        "    0.98 in preset cpu, section families.antsoccer",
+        "    0.99 in preset cpu, section families.antsoccer",
         "    0.995 in preset cpu, section families.antsoccer.low_level.action",
         "    0.9 in --set",
     ]
@@ -54,7 +54,7 @@ def test_a_key_shows_every_layer_that_set_it(capsys: pytest.CaptureFixture[str])
         ("skills.alpha --preset paper --set skills.alpha=0.1,0.2", "skills.alpha = 0.1, 0.2  (set by --set)"),
         ("skills.updates --preset paper", "    accepts whole number, at least 1; flag --pretrain-steps"),
         ("skills.updates --preset smoke", "skills.updates = 50  (set by preset smoke)"),
-        ("skills.horizon --preset cpu --method bc", "skills.horizon = 1  (set by method bc)"),
+        ("skills.horizon --env humanoidmaze --preset cpu --method bc", "skills.horizon = 1  (set by method bc)"),
         ("skills.horizon --preset cpu --set skills.horizon=4,20", "skills.horizon = 4, 20  (set by --set)"),
         ("values.estimator --preset cpu", "    accepts one of graph, iql"),
         ("values.hidden --preset cpu", "values.hidden = 256, 256  (set by preset cpu)"),

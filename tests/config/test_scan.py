@@ -153,7 +153,13 @@ def test_layers_keep_their_names() -> None:
         "--set",
     ]
     by_name = {layer.name: layer.values for layer in layers}
-    assert by_name["preset cpu, section families.antsoccer.low_level.action"] == {"high_level.discount": 0.995}
+    assert by_name["preset cpu, section families.antsoccer.low_level.action"] == {
+        "skills.horizon": 1,
+        "high_level.utd": 2,
+        "high_level.actor_updates": 1,
+        "high_level.discount": 0.995,
+        "high_level.value_scale": 20,
+    }
     assert by_name["flag"] == {"env": "antsoccer", "preset": "cpu", "method": "rlpd", "skills.alpha": 1}
     assert by_name["--set"] == {"high_level.utd": 3}
     unnamed = configs.run_layers("antsoccer")
