@@ -270,8 +270,9 @@ def measure(run: Path, draws: int, states: int, episodes: int, number: int) -> l
     """Return one row per member of a finished run."""
     trained, dataset = read_finished(RunFolder.open(run))
     trained = on_mujoco_c(trained)
-    run_row = {"task": trained.config.env, "method": trained.config.method, "view": trained.config.skills.view}
-    about = [run_row | settings for settings in configs.members(trained.config)]
+    config, skills = trained.config, trained.config.skills
+    run_row = {"task": config.env, "method": config.method, "view": skills.view, "horizon": skills.horizon}
+    about = [run_row | settings for settings in configs.members(config)]
     return measure_members(trained, dataset, about, draws, states, episodes, number)
 
 
