@@ -76,7 +76,8 @@ def add_parser(commands: Any) -> None:
     check.add_argument(
         "--method", metavar="NAME", default=Config.method, help=f"the method to train with (default {Config.method})"
     )
-    check.add_argument("--horizon", metavar="H", help="steps of a segment (default: the method's)")
+    check.add_argument("--preset", metavar="NAME", help="the preset to train with (default: as train.py's)")
+    check.add_argument("--horizon", metavar="H", help="steps of a segment (default: the preset's or the method's)")
     check.add_argument(
         "--set", metavar="KEY=VALUE", action="append", default=[], help="as for train.py; may be repeated"
     )
@@ -174,7 +175,8 @@ def _describe(rows: Rows) -> None:
 
 def _check(args: argparse.Namespace) -> int:
     flags = {"method": args.method, "skills.horizon": args.horizon}
-    config = load_config(args.env, None, {key: value for key, value in flags.items() if value is not None}, args.set)
+    given = {key: value for key, value in flags.items() if value is not None}
+    config = load_config(args.env, args.preset, given, args.set)
     check_method(config)
     env = _env(args.env, "mujoco")
     path = download.resolve(args.file).path

@@ -163,19 +163,17 @@ FILE: dict[str, tuple[Callable[[Path], Path], str]] = {
 }
 
 
-LONG = ("--set", "skills.horizon=20")  # presets differ in it
-
-
 def refused(path: Path, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> None:
     """Whether ``data check`` and training refuse ``path`` in the same words."""
     before = {item: item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()}
+    more = ("--preset", "smoke", *more)
     assert main(["data", "check", str(path), "--env", TASK, *more]) == 2
     checked = capsys.readouterr()
     line = next(line for line in (checked.out + checked.err).splitlines() if line.startswith("error: "))
     line = line.removeprefix("error: ").removeprefix(f"{path}: ")
     assert says in line
     out = tmp_path / "run"
-    flags = ["--env", TASK, "--preset", "smoke", "--dataset", str(path), "--out", str(out), *more]
+    flags = ["--env", TASK, "--dataset", str(path), "--out", str(out), *more]
     assert train_main(flags) == 2
     error = capsys.readouterr().err
     assert len(error.splitlines()) == 1 and error.startswith("error: ") and line in error, error
@@ -186,13 +184,13 @@ def refused(path: Path, says: str, tmp_path: Path, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize("what", COLUMNS)
 def test_bad_columns(what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change, says = COLUMNS[what]
-    refused(hdf5(tmp_path / "data", change(walk())), says, tmp_path, capsys, *LONG)
+    refused(hdf5(tmp_path / "data", change(walk())), says, tmp_path, capsys)
 
 
 @pytest.mark.parametrize("what", FILE)
 def test_bad_files(what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make, says = FILE[what]
-    refused(make(tmp_path / "data"), says, tmp_path, capsys, *LONG)
+    refused(make(tmp_path / "data"), says, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(
