@@ -25,7 +25,9 @@ def test_a_method_without_skills_and_one_with_a_guide_are_trained_too() -> None:
     assert names("guide", "label", "online") == ["label", "online"]
 
 
-@pytest.mark.parametrize("key", ["observation.view", "skills.horizon", "values.estimator", "exchange.share", "guide.hidden"])
+@pytest.mark.parametrize(
+    "key", ["observation.view", "skills.horizon", "values.estimator", "exchange.share", "guide.hidden"]
+)
 def test_a_setting_of_what_stays_is_refused(key: str) -> None:
     with pytest.raises(UserError, match=f"{key} would change nothing"):
         high_level.check_settings("qdos", ["high_level.utd=4", f"{key}=1"])
