@@ -19,10 +19,12 @@ import numpy as np
 
 from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import read_finished
+from qdos_brax.commands.arguments import guarded
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.schema import skill_keys
 from qdos_brax.errors import UserError
 from qdos_brax.methods.build import bind_phases, build_context, build_phases
+from qdos_brax.methods.given_skills import FREE
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
 from qdos_brax.runs.folder import RunFolder
@@ -32,7 +34,6 @@ COLUMNS = ("env", "method", "settings", "seed", "env_steps", "eval_success", "ev
 KEPT = ("values", "skills", "guide")  # what these phases learned, as far as the method has them, is the run's own
 # Groups of settings that only they, or the data, read; those of skills depend on the method.
 BEFORE = ("data", "exchange", "values", "guide")
-PLAYED = "skills.latent_box"  # how the high level plays skills, which is its own choice
 
 
 def after_skills(phases: list[MemberPhase]) -> list[MemberPhase]:
@@ -46,7 +47,7 @@ def check_settings(method: str, settings: list[str]) -> None:
     Raises:
         UserError: a setting would change nothing.
     """
-    learned = set(skill_keys(METHODS[method].low_level)) - {PLAYED}
+    learned = set(skill_keys(METHODS[method].low_level)) - FREE
     for key in (text.partition("=")[0] for text in settings):
         if key in learned or key.partition(".")[0] in BEFORE:
             raise UserError(f"{key} would change nothing: data and skills stay those of the run; give it to train.py")
@@ -113,10 +114,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="CSV file to add the rows to")
     args = parser.parse_args()
     prepare_jax()
-    try:
-        rows = train(args.run, args.members, args.settings)
-    except UserError as error:
-        parser.error(str(error))
+    rows = train(args.run, args.members, args.settings)
     if args.out:
         fresh = not args.out.exists()
         with args.out.open("a", encoding="utf-8", newline="") as file:
@@ -127,4 +125,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main))

@@ -23,7 +23,7 @@ from qdos_brax.skills.low_level import LowLevelPolicy
 from qdos_brax.skills.vae import Segments
 
 # How the high level plays skills, which is its own choice.
-_FREE = {"skills.latent_box"}
+FREE = {"skills.latent_box"}
 
 
 class GivenSkills(NamedTuple):
@@ -57,7 +57,7 @@ def read_skills(config: Config, env: Any, low_level: LowLevelPolicy) -> GivenSki
         )
     if len(theirs.seed) > 1 or found.arrays["normaliser"]["mean"].shape[0] != 1:
         raise UserError(f"{path} holds several members; export one of them with --member N")
-    free = _FREE if METHODS[config.method].information else _FREE | {"skills.alpha"}  # which runs without it set to 0
+    free = FREE if METHODS[config.method].information else FREE | {"skills.alpha"}  # which runs without it set to 0
     for key in skill_keys(kind):
         if key not in free and get(theirs, key) != get(config, key):
             raise UserError(
