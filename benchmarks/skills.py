@@ -6,8 +6,9 @@ Plays draws from the skill prior in the simulator, of the first member of each s
   lie from their mean;
 - R2 of the latent, as a linear map of the start's observation alone, and of that and the outcome: the second beyond the
   first is what z says about what happens;
-- the share of states in which a skill has to get at something and a draw does: in mazes states at a wall, less than
-  WALL away, from which a draw gets more than AWAY away; for an arm all states, where a draw moves a thing by MOVED;
+- the share of states in which skills have to get at something and do: in mazes states at a wall, less than WALL away,
+  from which WAY_STEPS of skills lead more than AWAY away, each the draw that leads furthest; for an arm all states,
+  where a draw moves a thing by MOVED;
 - random skills, one after the other: success and best score of whole episodes;
 - the oracle: success, score and steps of episodes in which the draw of most progress is played;
 - the search, which looks further ahead than one skill (``benchmarks/skill_search.py``): success, score, steps.
@@ -53,6 +54,7 @@ from qdos_brax.skills.slow_features import fit_slow_features
 
 WALL = 1.3  # m between the body and the nearest wall's face, at most, of a state at a wall
 AWAY = 1.5  # m
+WAY_STEPS = 20  # control steps, two seconds of an ant: short skills have as long as a long one
 MOVED = 0.02  # m or rad
 NEAREST = 5  # logged states that tell the cost to go
 
@@ -101,9 +103,15 @@ class Skills:
 
 
 class Truth(Protocol):
-    """Define what is measured of a task's macro steps. States are batches on the host."""
+    """Define what is measured of a task's macro steps. States are batches on the host.
+
+    Attributes:
+        reach_name: of what there is to get at.
+        reach_steps: control steps in which it counts; one skill at least.
+    """
 
     reach_name: str
+    reach_steps: int
 
     def left(self, states: State) -> np.ndarray:
         """Return float64[...], how far the states are from success."""
@@ -114,7 +122,7 @@ class Truth(Protocol):
         ...
 
     def reach(self, before: State, after: State) -> np.ndarray:
-        """Return bool[N, S'], whether a macro step gets at what there is to get at, of the states where it counts."""
+        """Return bool[N, S'], whether a way gets at what there is to get at, of the states[S'] where it counts."""
         ...
 
 
@@ -125,7 +133,7 @@ class MazeTruth:
         env: a maze.
     """
 
-    reach_name = "freed_from_walls"
+    reach_name, reach_steps = "freed_from_walls", WAY_STEPS
 
     def __init__(self, env: Any) -> None:
         self._env = env
@@ -158,7 +166,7 @@ class ArmTruth:
         dataset: its data.
     """
 
-    reach_name = "moves_things"
+    reach_name, reach_steps = "moves_things", 0
 
     def __init__(self, trained: TrainedRun, dataset: Dataset) -> None:
         values, horizon = trained.config.values, trained.config.skills.horizon
@@ -219,8 +227,25 @@ def from_logged_states(skills: Skills, truth: Truth, dataset: Dataset, states: i
         "spread": float(np.sqrt(outcome.var(axis=0).sum(axis=-1)).mean()),
         "r2_state": r2(z, seen),
         "r2_state_and_outcome": r2(z, seen, happened, turned),
-        truth.reach_name: float(truth.reach(before, found["end"]).any(axis=0).mean()),
+        truth.reach_name: share_reached(skills, truth, before, found),
     }
+
+
+def share_reached(skills: Skills, truth: Truth, before: State, found: Any) -> float:
+    """Return the share of states, of those where it counts, from which skills get at what there is to get at.
+
+    Args:
+        found: what a first skill's draws lead to from the states ``before``. Each further one of ``reach_steps`` begins
+            where the draw led that got furthest.
+    """
+    every = np.arange(len(before.reward))
+    reached = truth.reach(before, found["end"]).any(axis=0)
+    for turn in range(1, truth.reach_steps // skills.horizon):
+        furthest = np.linalg.norm(truth.outcome(before, found["end"]), axis=-1).argmax(axis=0)
+        states = jax.tree.map(lambda leaf, best=furthest: leaf[best, every], found["end"])
+        found = skills.play(states, jax.random.key(1 + turn))
+        reached |= truth.reach(before, found["end"]).any(axis=0)
+    return float(reached.mean())
 
 
 class Episodes(NamedTuple):

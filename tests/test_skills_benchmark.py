@@ -48,6 +48,41 @@ class Walk:
         return jax.tree.map(lambda leaf: leaf[None], row)
 
 
+class Line:
+    """A truth about walks on a line: one gets away from 0 by getting more than 2.5 to either side."""
+
+    reach_name, reach_steps = "away", 6
+
+    def outcome(self, before: State, after: State) -> np.ndarray:
+        return np.asarray(after.obs - before.obs)
+
+    def reach(self, before: State, after: State) -> np.ndarray:
+        return np.abs(self.outcome(before, after)[..., 0])[:, np.asarray(before.obs)[:, 0] == 0] > 2.5
+
+
+class Both(Walk):
+    """Skills of which two draws are tried: one step to the left, one to the right."""
+
+    def play(self, states: State, key: jax.Array) -> dict[str, Any]:
+        return {
+            "end": jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), states).replace(
+                obs=states.obs + jnp.array([-1.0, 1.0])[:, None, None]
+            )
+        }
+
+
+def test_short_skills_have_as_long_as_a_long_one_to_get_away() -> None:
+    """Three skills of two steps lead 3 away, each from where the one before got furthest; one or two do not."""
+    walk, truth = Both(30, 120), Line()
+    zero = jnp.zeros(3)
+    before = State(None, jnp.array([[0.0], [0.0], [9.0]]), zero, zero, {"score": zero})
+    found = walk.play(before, jax.random.key(0))
+    assert skills.share_reached(walk, truth, before, found) == 1.0
+    for steps in (0, 2, 5):
+        truth.reach_steps = steps
+        assert skills.share_reached(walk, truth, before, found) == 0.0
+
+
 def test_those_behind_go_on_from_those_ahead() -> None:
     """Score counts first, then what is left; all but the last quarter keep their state."""
     score = np.array([0.5, 0.0, 0.25, 0.5, 0.25, 0.0, 0.0, 0.0])
