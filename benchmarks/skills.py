@@ -46,6 +46,7 @@ from qdos_brax.analysis.film import of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import to_device
+from qdos_brax.data.exchange import exchanged
 from qdos_brax.methods.learners_view import learners_dataset
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
@@ -314,14 +315,15 @@ def measure_members(
 
     Args:
         trained: the run, on MuJoCo C.
-        dataset: its data.
+        dataset: its data, as logged.
         about: for each member, the row's first columns.
         draws: skills tried in each state.
         states: logged states.
         episodes: of random skills and of the oracle; 0 plays none.
         number: of searches; 0 makes none.
     """
-    dataset = learners_dataset(trained.env, dataset)
+    exchange = trained.config.exchange
+    dataset = learners_dataset(trained.env, exchanged(dataset, trained.env, exchange.share, exchange.seed))
     truth, rows = truth_of(trained, dataset), []
     for member, known in enumerate(about):
         started = time.perf_counter()
