@@ -10,7 +10,6 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from envs.body_frame import Frame
 from qdos_brax.data.device import DeviceData, Normaliser
@@ -91,12 +90,9 @@ class StartView:
         world = {"mean": normaliser.mean, "scale": normaliser.scale}
         plain = {"world": world, "seen": {"mean": 0.0, "scale": 1.0}}
         seen = self.see(plain, windows, self.pose(plain, windows[:, 0])[:, None])
-        # On the host: XLA's sums over many rows depend, in their last bits, on how many cores there are.
-        rows = np.asarray(seen, np.float64)
-        deviation = rows.std(axis=(0, 1))
-        scale = np.where(deviation < _CONSTANT, 1.0, deviation)
-        seen_of = {"mean": jnp.asarray(rows.mean(axis=(0, 1)), jnp.float32), "scale": jnp.asarray(scale, jnp.float32)}
-        return {"world": world, "seen": seen_of}
+        deviation = jnp.std(seen, axis=(0, 1))
+        scale = jnp.where(deviation < _CONSTANT, 1.0, deviation)
+        return {"world": world, "seen": {"mean": jnp.mean(seen, axis=(0, 1)), "scale": scale}}
 
     def pose(self, params: Any, observation: jax.Array) -> jax.Array:
         """Return the frame's pose."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from typing import Any
 
 import jax
@@ -87,26 +84,6 @@ def test_what_is_seen_has_mean_0_and_deviation_1_over_the_data() -> None:
     np.testing.assert_allclose(seen.mean(axis=(0, 1)), 0, atol=1e-4)
     varies = [0, 1, 2, 5, 6, 7]
     np.testing.assert_allclose(seen.std(axis=(0, 1))[varies], 1, rtol=1e-3)
-
-
-FIT = """
-import os, sys
-os.sched_setaffinity(0, list(os.sched_getaffinity(0))[: int(sys.argv[1])])
-import jax, jax.numpy as jnp
-from envs.body_frame import BodyFrame
-from qdos_brax.data.device import Normaliser
-from qdos_brax.skills.views import make_view
-windows = jax.random.normal(jax.random.key(0), (4_000, 10, 8))
-params = make_view("start", BodyFrame(heading=2, vectors=(6,))).fit(windows, Normaliser(jnp.zeros(8), jnp.ones(8)))
-print([leaf.tolist() for leaf in jax.tree.leaves(params)])
-"""
-
-
-@pytest.mark.skipif(len(getattr(os, "sched_getaffinity", lambda _: "1")(0)) < 2, reason="needs two cores, on Linux")
-def test_what_a_view_knows_does_not_depend_on_the_number_of_cores() -> None:
-    """A seed learns the same on one core as on two."""
-    one, two = (subprocess.check_output([sys.executable, "-c", FIT, cores]) for cores in ("1", "2"))
-    assert one == two
 
 
 def test_training_leaves_what_the_view_knows_as_it_is() -> None:
