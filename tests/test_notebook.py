@@ -7,6 +7,7 @@ import importlib
 import inspect
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,6 +32,18 @@ def test_the_notebook_calls_our_functions_as_they_are() -> None:
     for call in calls:
         signature = inspect.signature(ours[getattr(call.func, "id", "")])
         signature.bind(*call.args, **{str(word.arg): None for word in call.keywords})
+
+
+def test_the_notebook_plays_an_episode(finished: Path) -> None:
+    """Its cells from "An episode" on, in this process; without OpenGL there is no film to show."""
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    first = next(index for index, cell in enumerate(cells) if "".join(cell["source"]).startswith("## An episode"))
+    shown: list[str] = []
+    names: dict[str, Any] = {"run": finished, "HTML": str, "display": shown.append}
+    for cell in cells[first + 1 :]:
+        exec("".join(cell["source"]), names)
+    assert 1 < len(names["qpos"]) == len(names["moments"]) <= 26
+    assert len(shown) == bool(names["pictures"])
 
 
 @pytest.mark.slow

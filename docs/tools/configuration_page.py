@@ -28,15 +28,18 @@ your task, and which layer set it, says
 python -m qdos_brax config skills.alpha --env antsoccer --method supe
 ```
 
-`--set KEY=VALUE` takes any key; where a list makes a scan, several values are trained as one program
-([Scans](scans.md)). A list of any other key makes one program after another."""
+`--set KEY=VALUE` takes any key (but `env`, `method` and `preset`, which have flags); where a list makes a
+scan, several values are trained as one program ([Scans](scans.md)). A list of any other key makes one program
+after another."""
 
 
 SHRUNK = """## What preset cpu changes of the published methods
 
-Every method has the values that its authors published ([Methods](methods.md)); preset `paper` keeps them. These are the
-ones that preset `cpu` has made smaller or moved, so that a run takes minutes on two cores; `--set KEY=VALUE` brings one
-back."""
+Every method has the values that its authors published ([Methods](methods.md)); preset `paper` keeps them.
+Where these are not the configuration's own defaults, the table has the ones that preset `cpu` has made
+smaller or moved, so that a run takes minutes on two cores; `--set KEY=VALUE` brings one back. Sizes that are
+defaults shrink as well, such as the 32 proposals of `qc` (8) or the ten critics of `wsrl` (4): `python -m
+qdos_brax config KEY --env TASK --method METHOD` has both."""
 
 
 def page() -> str:
