@@ -32,8 +32,7 @@ _EXAMPLES = """examples:
   {prog} --env antmaze-medium --method qdos,supe --seed 0,1   # a comparison
   {prog} --env antsoccer --preset smoke                       # does it run here?
   {prog} --resume runs/mine"""
-_EPILOG = """--set takes any key of config.yaml but env, method and preset; python -m qdos_brax config lists and
-explains them.
+_EPILOG = """--set takes any key of config.yaml; python -m qdos_brax config lists and explains them.
 Methods: docs/methods.md."""
 
 
