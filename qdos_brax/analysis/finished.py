@@ -28,6 +28,7 @@ from qdos_brax.runs.checkpoint import final_artifacts
 from qdos_brax.runs.export import read_export
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import resume_command
+from qdos_brax.runs.metrics import PART_DONE
 
 
 class TrainedRun(NamedTuple):
@@ -153,7 +154,7 @@ def evaluate_run(run: Path, episodes: int) -> list[dict[str, float]]:
     result = program(trained.artifacts, trained.hyper, evaluation_key())
     columns, names = summary(result), ("success", "return", "length", "score")
     means = {name: columns[f"eval/{name}"] for name in names if f"eval/{name}" in columns}
-    means |= {f"{part} done": columns[f"eval/done/{part}"] for part in result.parts or {}}
+    means |= {f"{part} done": columns[f"{PART_DONE}{part}"] for part in result.parts or {}}
     return [
         {**member, **{name: float(value[index]) for name, value in means.items()}, "episodes": episodes}
         for index, member in enumerate(members)

@@ -11,6 +11,7 @@ import numpy as np
 
 from envs.brax_base import Env, State
 from qdos_brax.high_level.macro_step import macro_step
+from qdos_brax.runs.metrics import PART_DONE
 
 
 class Episodes(NamedTuple):
@@ -79,7 +80,7 @@ def summary(episodes: Episodes) -> dict[str, np.ndarray]:
     """Return columns of metrics.csv, [members] each, of episodes[members, N]."""
     success = np.asarray(episodes.success)
     score = {} if episodes.score is None else {"eval/score": np.asarray(episodes.score).mean(axis=-1)}
-    parts = {f"eval/done/{name}": np.mean(done, axis=-1) for name, done in (episodes.parts or {}).items()}
+    parts = {f"{PART_DONE}{name}": np.mean(done, axis=-1) for name, done in (episodes.parts or {}).items()}
     return score | {
         "eval/success": success.mean(axis=-1),
         "eval/return": np.asarray(episodes.episode_return).mean(axis=-1),

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 from qdos_brax.report.statistics import Estimate, interquartile_mean, mean_std, probability_of_improvement
 from qdos_brax.report.study import Member, Setting, Study
+from qdos_brax.runs.metrics import PART_DONE
 
 _ALL = "all tasks"
 _NONE = "-"
-_DONE = "eval/done/"  # columns of metrics.csv, one per part of the task
 _CsvRow = dict[str, str | float]
 
 
@@ -158,7 +158,9 @@ def _parts_tables(study: Study) -> list[Table]:
 def _last_parts(member: Member) -> dict[str, float]:
     """Return the share of episodes by part at the member's last evaluation; {} for a task without parts."""
     for row in reversed(member.rows):
-        done = {key.removeprefix(_DONE): float(cell) for key, cell in row.items() if key.startswith(_DONE) and cell}
+        done = {
+            key.removeprefix(PART_DONE): float(cell) for key, cell in row.items() if key.startswith(PART_DONE) and cell
+        }
         if done:
             return done
     return {}

@@ -19,6 +19,9 @@ Row = dict[str, str]
 _FIRST = ("phase", "env_steps", "update", "eval/success", "eval/return")
 _LAST = "sps"
 
+PART_DONE = "eval/done/"
+"""With the name of a part of the task: the column of the share of evaluation episodes that end with it done."""
+
 
 class Observer(Protocol):
     """Receive every row that is written to metrics.csv."""
