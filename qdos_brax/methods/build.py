@@ -16,7 +16,6 @@ from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS, Method
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
-from qdos_brax.data.exchange import exchanged
 from qdos_brax.data.requirements import refuse, unmet
 from qdos_brax.high_level.actor_critic import AGENT, ActorCritic
 from qdos_brax.high_level.jump_start import JumpStart
@@ -33,7 +32,7 @@ from qdos_brax.labels.rnd import RND
 from qdos_brax.methods.actor_critics import make_actor_critic
 from qdos_brax.methods.context import BuildContext, SpaceSizes, offline_phase
 from qdos_brax.methods.given_skills import GivenSkills, read_skills
-from qdos_brax.methods.learners_view import learners_dataset, learners_env
+from qdos_brax.methods.learners_view import learners_env, run_dataset
 from qdos_brax.methods.low_level_kinds import make_low_level, skill_phases
 from qdos_brax.offline.actor_critic import OfflineActorCritic
 from qdos_brax.offline.bc import BC
@@ -59,9 +58,8 @@ def build_context(config: Config, env: Any, dataset: Dataset) -> BuildContext:
     """
     configs.check_method(config)
     refuse(dataset.source, unmet(dataset, env, config))
-    dataset = exchanged(dataset, env, config.exchange.share, config.exchange.seed)
     env = learners_env(config, env)
-    dataset, given = learners_dataset(env, dataset), _given_skills(config, env)
+    dataset, given = run_dataset(config, env, dataset), _given_skills(config, env)
     data, normaliser = to_device(dataset, config.skills.horizon, None if given is None else given.normaliser)
     return BuildContext(config, METHODS[config.method], env, dataset, data, normaliser, given)
 

@@ -12,6 +12,7 @@ import numpy as np
 import envs
 from qdos_brax.config import Config
 from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.exchange import exchanged
 
 
 def learners_env(config: Config, env: Any) -> Any:
@@ -31,6 +32,17 @@ def learners_dataset(env: Any, dataset: Dataset) -> Dataset:
         observations=learners_observations(env, dataset.observations),
         next_observations=learners_observations(env, dataset.next_observations),
     )
+
+
+def run_dataset(config: Config, env: Any, dataset: Dataset) -> Dataset:
+    """Return what a run learns from, of the data as logged: things exchanged, and as the learners of ``env`` see it.
+
+    Args:
+        config: the run's configuration.
+        env: its ``learners_env``.
+        dataset: the data of the task.
+    """
+    return learners_dataset(env, exchanged(dataset, env, config.exchange.share, config.exchange.seed))
 
 
 def learners_observations(env: Any, observations: np.ndarray) -> np.ndarray:
