@@ -27,6 +27,7 @@ from qdos_brax.methods.build import bind_phases, build_context, build_phases
 from qdos_brax.methods.given_skills import FREE
 from qdos_brax.population.members import Population
 from qdos_brax.population.phase import MemberPhase
+from qdos_brax.runs.checkpoint import as_device_arrays
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
 
@@ -65,7 +66,8 @@ def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, 
     phases = after_skills(build_phases(context))
     bind_phases(phases, Population(configs.population_hyper(config, chosen), 1, jax.local_devices()), context.data)
     kept = {name: value for name, value in trained.artifacts.items() if name not in ("actor", "normaliser")}
-    artifacts = jax.tree.map(lambda x: x[np.asarray(members)], kept)
+    # From host memory: arrays that say on which device they lie would make a chunk's second call compile it anew.
+    artifacts = as_device_arrays(jax.tree.map(lambda x: np.asarray(x)[members], kept))
     seeds = np.asarray([member["seed"] for member in chosen], np.uint32)
     rows, began = [], time.perf_counter()
     for index, phase in enumerate(phases):
