@@ -19,6 +19,9 @@ from envs.physics.base import Engine, PipelineState
 from envs.scene import Scene, free_view
 from envs.things import Thing
 
+# fold_in(key, i) is split(key, n)[i] (findings/jax-fold-in-gives-the-keys-of-split.sh): a number that no split reaches.
+_NEXT_EPISODE = 0x5EED0
+
 
 class SimulatorStates(Protocol):
     """Hold simulator states: a ``PipelineState``, or the rows of a data set."""
@@ -172,7 +175,8 @@ class Task(Env, ABC):
             qpos: float[nq].
             qvel: float[nv].
             goal: what has to be reached; None takes the task's goal.
-            key: what the physics' chances, and ``AutoReset`` for the next episode, draw from; None takes a fixed one.
+            key: what the physics' chances are drawn from, and the key of the next episode under ``AutoReset``, so that
+                the one that a start was drawn from will do; None takes a fixed one.
             extra: int[e], the discrete state; None takes zeros.
         """
         pipeline_state = self.start_physics(qpos, qvel, extra, key)
@@ -181,7 +185,7 @@ class Task(Env, ABC):
             "goal": jnp.asarray(self._goal if goal is None else goal, jnp.float32),
             "truncation": jnp.zeros(()),
             "final_obs": obs,
-            "reset_key": jax.random.key(0) if key is None else key,
+            "reset_key": jax.random.fold_in(jax.random.key(0) if key is None else key, _NEXT_EPISODE),
         }
         metrics = {name: jnp.zeros(()) for name in self.metric_names}
         return State(pipeline_state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)

@@ -19,7 +19,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.labelling import label
 from qdos_brax.data.readers import d4rl, minari, ogbench
 from qdos_brax.data.readers.rows import Rows, unreadable
-from qdos_brax.data.readers.table import CHECKSUMS, checksum
+from qdos_brax.data.readers.table import CHECKSUMS, HDF5Table, NpzTable, checksum
 from qdos_brax.data.requirements import refuse
 from qdos_brax.errors import UserError
 from qdos_brax.files import replacing, user_errors
@@ -54,10 +54,14 @@ def load(path: str | os.PathLike[str], jump: float | None = LARGEST_MOVE) -> Row
     """
     path = data_file(path)
     if not _is_hdf5(path):
-        return ogbench.load(path)
+        with unreadable(path), NpzTable(path) as archive:
+            return d4rl.load(archive, jump) if d4rl.is_d4rl(archive) else ogbench.load(archive)
     with unreadable(path), h5py.File(path, "r") as file:
         by_episode = minari.is_minari(file)
-    return minari.load(path) if by_episode else d4rl.load(path, jump)
+    if by_episode:
+        return minari.load(path)
+    with unreadable(path), HDF5Table(path) as table:
+        return d4rl.load(table, jump)
 
 
 def data_file(path: str | os.PathLike[str]) -> Path:

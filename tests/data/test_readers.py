@@ -262,6 +262,33 @@ def test_d4rl_rows_at_the_goal_are_terminal_without_ending_the_episode(tmp_path:
     np.testing.assert_array_equal(np.flatnonzero(rows.terminals), [3, 4, 11])  # row 8 is gone
 
 
+def test_d4rl_arrays_in_an_npz_are_read_as_in_an_hdf5(tmp_path: Path) -> None:
+    """What ``numpy.savez`` makes of ``env.get_dataset()``: its terminals are no rows without an action."""
+    columns = d4rl_antmaze()
+    columns["terminals"][[3, 4, 12]] = True
+    columns["rewards"][[3, 4, 12]] = 1.0
+    np.savez(tmp_path / "a.npz", **columns)
+    rows = formats.load(tmp_path / "a.npz")
+    assert_antmaze(rows, columns)
+    np.testing.assert_array_equal(np.flatnonzero(rows.ends), [7, 13, 20])
+    np.testing.assert_array_equal(np.flatnonzero(rows.terminals), [3, 4, 11])
+    np.testing.assert_array_equal(np.flatnonzero(rows.rewards), [3, 4, 11])
+
+
+@pytest.mark.parametrize("missing", ["the positions", "the distance that is too far for a step"])
+def test_d4rl_episodes_end_at_terminals_where_nothing_shows_that_they_go_on(tmp_path: Path, missing: str) -> None:
+    """The ordinary layout: an episode that terminates has no timeout, and no next observation."""
+    columns = d4rl_antmaze()
+    columns["terminals"][15], columns["timeouts"][15] = True, False
+    if missing == "the positions":
+        del columns["infos/qpos"], columns["infos/qvel"]
+    path = write_d4rl(tmp_path / "a.hdf5", columns)
+    rows = formats.load(path) if missing == "the positions" else formats.load(path, None)
+    np.testing.assert_array_equal(np.flatnonzero(rows.ends), [7, 14, 21])  # a terminal row stays
+    assert rows.terminals is not None
+    np.testing.assert_array_equal(np.flatnonzero(rows.terminals), [14])
+
+
 def test_d4rl_timeouts_out_of_step_do_not_join_episodes(tmp_path: Path) -> None:
     """Version 0's files (D4RL issue 77): the marks come two rows late, the resets are where the body jumps."""
     columns = d4rl_antmaze()

@@ -87,6 +87,20 @@ def test_every_episode_starts_elsewhere() -> None:
     np.testing.assert_array_equal(again.obs, starts[0][0])
 
 
+@pytest.mark.parametrize("name", ["antmaze-medium", "cube-single", "scene-task1", "kitchen-mixed"])
+def test_every_family_starts_each_episode_elsewhere(name: str) -> None:
+    env = envs.AutoReset(envs.make(name, physics="mujoco"))
+    step = jax.jit(env.step)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    starts = [np.asarray(state.obs)]
+    for _ in range(2):
+        last = state.replace(pipeline_state=state.pipeline_state.replace(steps=jnp.int32(env.episode_length - 1)))
+        state = step(last, jnp.zeros(env.action_size))
+        assert float(state.done) == 1.0
+        starts.append(np.asarray(state.obs))
+    assert len(np.unique(starts, axis=0)) == 3
+
+
 def test_broken_physics_is_reset_and_counted() -> None:
     env = toy()
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), 2))

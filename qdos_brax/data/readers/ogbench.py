@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from qdos_brax.data.readers.rows import Rows, unreadable
-from qdos_brax.data.readers.table import NpzTable
+from qdos_brax.data.readers.rows import Rows
+from qdos_brax.data.readers.table import DataTable
 from qdos_brax.errors import UserError
 
 _OPTIONAL = ("next_observations", "valids", "rewards", "masks", "qpos", "qvel", "button_states")
 
 
-def load(path: Path) -> Rows:
+def load(table: DataTable) -> Rows:
     """Return the transitions of an OGBench ``.npz``.
 
     Published files have T + 1 rows per trajectory; the last is only a next state. ``load_dataset`` makes of them the
@@ -23,34 +21,33 @@ def load(path: Path) -> Rows:
     Raises:
         UserError: unreadable, incomplete, or sizes that do not fit.
     """
-    with unreadable(path), NpzTable(path) as table:
-        num_rows = table.require(("observations", "actions", "terminals"), _OPTIONAL)
-        marked = table.column("terminals") != 0
-        notes = []
-        if num_rows and not marked[-1]:
-            notes.append("the last trajectory is cut off before its end")
-        if "next_observations" in table:
-            keep, ends = None, marked
-            (observations,), (following,) = table.floats("observations", None), table.floats("next_observations", None)
-        else:
-            keep = table.column("valids") != 0 if "valids" in table else ~marked
-            if num_rows:
-                keep[-1] = False  # a file cut inside a trajectory: its last row has no next state either
-            is_next = np.roll(keep, 1)
-            ends = ~np.roll(keep, -1)[keep]
-            if "valids" in table and not np.array_equal(ends, marked[keep]) and not notes:
-                raise UserError(f"{path}: 'valids' and 'terminals' mark different trajectories: the file is damaged")
-            observations, following = table.floats("observations", keep, is_next)
-        if len(ends):
-            ends[-1] = True
-        rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes)
-        for key in ("qpos", "qvel"):
-            if key in table:
-                setattr(rows, key, table.floats(key, keep)[0])
-        if "button_states" in table:  # the scene's discrete state; other buttons are no task here
-            rows.extra = np.round(table.floats("button_states", keep)[0]).astype(np.int32)
-        if "rewards" in table:
-            rows.rewards = table.numbers("rewards", keep)
-        if "masks" in table:
-            rows.terminals = 1.0 - table.numbers("masks", keep)
-        return rows
+    num_rows = table.require(("observations", "actions", "terminals"), _OPTIONAL)
+    marked = table.column("terminals") != 0
+    notes = []
+    if num_rows and not marked[-1]:
+        notes.append("the last trajectory is cut off before its end")
+    if "next_observations" in table:
+        keep, ends = None, marked
+        (observations,), (following,) = table.floats("observations", None), table.floats("next_observations", None)
+    else:
+        keep = table.column("valids") != 0 if "valids" in table else ~marked
+        if num_rows:
+            keep[-1] = False  # a file cut inside a trajectory: its last row has no next state either
+        is_next = np.roll(keep, 1)
+        ends = ~np.roll(keep, -1)[keep]
+        if "valids" in table and not np.array_equal(ends, marked[keep]) and not notes:
+            raise UserError(f"{table.path}: 'valids' and 'terminals' mark different trajectories: the file is damaged")
+        observations, following = table.floats("observations", keep, is_next)
+    if len(ends):
+        ends[-1] = True
+    rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes)
+    for key in ("qpos", "qvel"):
+        if key in table:
+            setattr(rows, key, table.floats(key, keep)[0])
+    if "button_states" in table:  # the scene's discrete state; other buttons are no task here
+        rows.extra = np.round(table.floats("button_states", keep)[0]).astype(np.int32)
+    if "rewards" in table:
+        rows.rewards = table.numbers("rewards", keep)
+    if "masks" in table:
+        rows.terminals = 1.0 - table.numbers("masks", keep)
+    return rows
