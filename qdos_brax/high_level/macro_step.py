@@ -41,7 +41,7 @@ class InnerStep(NamedTuple):
     Attributes:
         observation: [obs], before the step, as the environment gives it.
         action: [act].
-        reward: of the step.
+        reward: of the step, 0 if it is idle.
         live: 1 if the episode was still going on, otherwise 0.
     """
 
@@ -83,16 +83,18 @@ def macro_step(
         finite = jnp.all(jnp.isfinite(new.obs)) & jnp.isfinite(new.reward)
         terminated = (new.done > 0.5) & (new.info["truncation"] < 0.5)
         live = alive.astype(jnp.float32)
+        # An idle state is not finite, nor is what a task computes of it, and 0 times NaN is NaN.
+        reward, success = (jnp.where(alive, value, 0.0) for value in (new.reward, new.metrics["success"]))
         result = MacroStep(
-            reward=result.reward + live * discount**index * new.reward,
+            reward=result.reward + discount**index * reward,
             mask=jnp.where(alive & terminated, 0.0, result.mask),
             next_observation=jnp.where(alive, new.info["final_obs"], result.next_observation),
             steps=result.steps + alive.astype(jnp.int32),
-            episode_return=result.episode_return + live * new.reward,
-            success=jnp.maximum(result.success, live * new.metrics["success"]),
+            episode_return=result.episode_return + reward,
+            success=jnp.maximum(result.success, success),
             finite=result.finite & (finite | ~alive),
         )
-        recorded = record(InnerStep(state.obs, action, new.reward, live))
+        recorded = record(InnerStep(state.obs, action, reward, live))
         return (jax.tree.map(lambda a, b: jnp.where(alive, a, b), new, state), result), recorded
 
     zero = jnp.zeros(())

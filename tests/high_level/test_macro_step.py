@@ -72,6 +72,28 @@ def test_a_finished_episode_gives_no_live_steps():
     assert int(result.steps) == 0 and float(result.reward) == 0.0
 
 
+class DenseLine(Line):
+    """A reward that depends on x, which idle states lack, as MuJoCo C's lack qpos."""
+
+    def step(self, state, action):
+        new = super().step(state, action)
+        return new.replace(reward=-state.pipeline_state)
+
+    def idle(self, state, over):
+        return state.replace(pipeline_state=jnp.where(over, jnp.nan, state.pipeline_state))
+
+
+@pytest.mark.parametrize("env", [DenseLine(goal=2.0), DenseLine(goal=100.0, cap=3)])
+def test_idle_steps_of_a_dense_reward_earn_nothing(env):
+    # x = 0, 1, 2 before the three live steps; the other three are not lived.
+    state = env.reset(jax.random.key(0))
+    _, result = macro_step(env, lambda obs, step: jnp.ones(1), state, 6, 0.5, record=lambda step: step.reward)
+    assert (int(result.steps), bool(result.finite)) == (3, True)
+    assert float(result.reward) == -0.5 * 1 - 0.25 * 2
+    assert float(result.episode_return) == -3.0
+    np.testing.assert_array_equal(result.track, [0, -1, -2, 0, 0, 0])
+
+
 def test_a_broken_simulation_is_told():
     _, result = play(Line(), horizon=2, discount=1.0, action=jnp.nan)
     assert not bool(result.finite)
