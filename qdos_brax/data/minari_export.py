@@ -22,8 +22,9 @@ def export_minari(dataset: Dataset, out: Path, task: str) -> None:
     """Write ``dataset`` as a Minari set: an episode per group, with one observation more than actions.
 
     Rewards are the task's, and a step terminates where its mask is 0, even if the episode goes on in the data; the
-    last step of every other episode truncates. Simulator states are ``infos/qpos`` and ``infos/qvel``. With
-    MINARI_DATASETS_PATH at the folder that ``out`` lies in, ``minari.load_dataset(out.name)`` reads it.
+    last step of every other episode truncates. Simulator states are ``infos/qpos``, ``infos/qvel`` and, where a task
+    has a discrete state, ``infos/extra``; ``infos/quality`` is that of the steps. With MINARI_DATASETS_PATH at the
+    folder that ``out`` lies in, ``minari.load_dataset(out.name)`` reads it.
 
     Args:
         dataset: transitions, labelled for the task.
@@ -80,12 +81,12 @@ def _episode(dataset: Dataset, first: int, stop: int) -> dict[str, Any]:
     terminations = dataset.masks[part] == 0
     truncations = np.zeros(stop - first, bool)
     truncations[-1] = not terminations[-1]
-    states = {"qpos": dataset.qpos, "qvel": dataset.qvel}
+    infos = {name: getattr(dataset, name) for name in ("qpos", "qvel", "extra", "quality")}
     return {
         "observations": np.concatenate([dataset.observations[part], dataset.next_observations[stop - 1 : stop]]),
         "actions": dataset.actions[part],
         "rewards": dataset.rewards[part],
         "terminations": terminations,
         "truncations": truncations,
-        "infos": {name: array[part] for name, array in states.items() if array is not None},
+        "infos": {name: array[part] for name, array in infos.items() if array is not None},
     }

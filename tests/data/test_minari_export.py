@@ -10,6 +10,8 @@ import pytest
 import envs
 from qdos_brax.commands.main import main
 from qdos_brax.data import formats
+from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.minari_export import export_minari
 
 SOURCE = Path(__file__).parent / "files" / "ogbench-antmaze-medium.npz"
 
@@ -34,6 +36,32 @@ def test_minari_and_our_reader_find_the_rows(tmp_path: Path, monkeypatch: pytest
         assert episode.truncations.tolist() == [False] * (stop - first - 1) + [True]
         assert not episode.terminations.any()
     assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def test_discrete_states_and_qualities_are_kept(tmp_path: Path) -> None:
+    """A scene without the state of its buttons would be refused by training."""
+    pytest.importorskip("minari")
+    rng = np.random.default_rng(0)
+    states = rng.normal(size=(12, 3)).astype(np.float32)
+    before = Dataset(
+        observations=states,
+        next_observations=np.roll(states, -1, axis=0),
+        actions=rng.uniform(-1, 1, (12, 2)).astype(np.float32),
+        rewards=np.zeros(12, np.float32),
+        masks=np.ones(12, np.float32),
+        ends=np.isin(np.arange(12), [4, 11]),
+        source="by hand",
+        qpos=rng.normal(size=(12, 4)).astype(np.float32),
+        qvel=rng.normal(size=(12, 4)).astype(np.float32),
+        extra=rng.integers(0, 2, (12, 2)).astype(np.int32),
+        quality=rng.integers(-1, 3, 12).astype(np.int8),
+    )
+    export_minari(before, tmp_path / "by-hand-v0", "a task by hand")
+    after = formats.load(tmp_path / "by-hand-v0")
+    for name in ("qpos", "qvel", "extra", "quality"):
+        found, expected = getattr(after, name), getattr(before, name)
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+        assert found.dtype == expected.dtype
 
 
 @pytest.mark.parametrize("name", ["antmaze", "taken-v0"])

@@ -18,6 +18,9 @@ from qdos_brax.errors import UserError
 _MAIN_FILE = "main_data.hdf5"
 _REQUIRED = ("observations", "actions", "rewards", "terminations", "truncations")
 _STATES = {"infos/qpos", "infos/qvel"}
+# What is read of an episode's infos where all episodes have it, by the rows' field.
+_INFOS = {"qpos": "infos/qpos", "qvel": "infos/qvel", "extra": "infos/extra", "quality": "infos/quality"}
+_INTEGERS = {"extra": np.int32, "quality": np.int8}
 _GOAL_KEYS = {"observation", "achieved_goal", "desired_goal"}
 
 
@@ -65,9 +68,9 @@ def load(path: Path) -> Rows:
             terminals=np.empty(total, np.float32),
             rewards=np.empty(total, np.float32),
         )
-        if set(first) >= _STATES:
-            rows.qpos = np.empty((total, *first["infos/qpos"].shape[1:]), np.float32)
-            rows.qvel = np.empty((total, *first["infos/qvel"].shape[1:]), np.float32)
+        for field in _fields(first):
+            shape = (total, *first[_INFOS[field]].shape[1:])
+            setattr(rows, field, np.empty(shape, _INTEGERS.get(field, np.float32)))
         rows.ends[stops - 1] = True
         for name, start, stop in zip(names, [0, *stops], stops, strict=False):
             # One episode's data sets are open at a time, for each has a cache of its own.
@@ -92,10 +95,16 @@ def _episode_names(path: Path, file: h5py.File) -> list[str]:
     return [f"episode_{number}" for number in numbers]
 
 
+def _fields(items: Mapping[str, Any]) -> list[str]:
+    """Return the rows' fields that an episode's infos hold; simulator states count if they are whole."""
+    whole = set(items) >= _STATES
+    return [field for field, key in _INFOS.items() if key in items and (whole or key not in _STATES)]
+
+
 def _open(path: Path, file: h5py.File, name: str) -> dict[str, Any]:
     """Return what an episode holds; ``observations`` may be a group."""
     group, items = file[name], {}
-    for key in (*_REQUIRED, *_STATES):
+    for key in (*_REQUIRED, *_INFOS.values()):
         try:
             items[key] = _item(group, key)
         except KeyError:
@@ -114,8 +123,10 @@ def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: sli
         shape = _set(items[key]).shape
         if shape not in ((length,), (length, 1)):
             raise UserError(f"{path}: {name} has {length} actions and {key} of shape {shape}: the file is damaged")
-    if (set(items) >= _STATES) != (rows.qpos is not None):
-        raise UserError(f"{path}: {name} and the first episode differ in having infos/qpos and infos/qvel")
+    fields = _fields(items)
+    for field, key in _INFOS.items():
+        if (field in fields) != (getattr(rows, field) is not None):
+            raise UserError(f"{path}: {name} and the first episode differ in having {key}")
     observations, expected = _observations(items["observations"]), (length + 1, rows.observations.shape[1])
     if observations.shape != expected:
         raise UserError(
@@ -126,12 +137,12 @@ def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: sli
     assert rows.rewards is not None and rows.terminals is not None
     rows.rewards[part] = _numbers(items["rewards"]).reshape(-1)
     rows.terminals[part] = _numbers(items["terminations"]).reshape(-1) != 0
-    for key, target in (("infos/qpos", rows.qpos), ("infos/qvel", rows.qvel)):
-        if target is not None:
-            values = _numbers(items[key])
-            if len(values) not in (length, length + 1):
-                raise UserError(f"{path}: {name} has {len(values)} rows of {key}: the file is damaged")
-            target[part] = values[:length]  # one more in today's files, where reset's info comes first
+    for field in fields:
+        values = _numbers(items[_INFOS[field]])
+        if len(values) not in (length, length + 1):
+            raise UserError(f"{path}: {name} has {len(values)} rows of {_INFOS[field]}: the file is damaged")
+        values = values[:length]  # one more in today's files, where reset's info comes first
+        getattr(rows, field)[part] = np.round(values) if field in _INTEGERS else values
 
 
 def _observations(item: Any) -> np.ndarray:
