@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 
-import envs
 from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import (
     conclude,
@@ -26,6 +25,7 @@ from qdos_brax.analysis.finished import trained_run
 from qdos_brax.collection.default_set import default_dataset
 from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
+from qdos_brax.config.task import make_task
 from qdos_brax.data import download, formats, origin, relocation
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.requirements import refuse, remarks, unmet_by_task
@@ -85,7 +85,7 @@ def start(
     observers.check(first.run)
     for config in asked.values():
         configs.check_method(config)
-    env = _make_env(first)
+    env = make_task(first.env, first.physics)
     for config in asked.values():
         refuse(config.env, unmet_by_task(env, config))
         check_skills(config, env)
@@ -95,7 +95,9 @@ def start(
         _start_run(first, env, started, hosts, chosen=not preset_given)
         return
     path = Path(first.out or _new_path(first, env, "comparison"))
-    runs = {name: _resolved(config, _make_env(config), path / name) for name, config in asked.items()}
+    runs = {
+        name: _resolved(config, make_task(config.env, config.physics), path / name) for name, config in asked.items()
+    }
     comparison.create(path, {name: configs.to_yaml(config) for name, config in runs.items()})
     _compare(path, started, chosen=not preset_given)
 
@@ -234,7 +236,7 @@ def _run_shares(config: Config, folder: RunFolder, own: list[RunFolder], started
 
 
 def _load_data(config: Config) -> _Data:
-    env = _make_env(config)
+    env = make_task(config.env, config.physics)
     before = time.perf_counter()
     path, digest = _data_file(config, env)
     print(f"data      {path}", flush=True)
@@ -277,13 +279,6 @@ def _train(
         observers=observers.make(config.run, folder, members),
     )
     return config, summary, artifacts
-
-
-def _make_env(config: Config) -> Any:
-    try:
-        return envs.make(config.env, physics=config.physics)
-    except ValueError as error:  # envs does not know UserError; its messages are written for the user too
-        raise UserError(str(error)) from error
 
 
 def _data_file(config: Config, env: Any) -> tuple[Path, str | None]:

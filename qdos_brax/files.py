@@ -38,6 +38,20 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
         np.savez_compressed(partial, allow_pickle=False, **arrays)
 
 
+def try_to_write(path: Path) -> None:
+    """Make the folder of ``path`` and, for a moment, a file in it: before long work whose result it is to take.
+
+    Raises:
+        UserError: the file system refuses, or ``path`` is a folder.
+    """
+    with user_errors(path):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _partial(path).touch()
+        _partial(path).unlink()
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a file name of the same ending to write to; rename it to ``path`` at the end, or remove it on an error.
@@ -45,7 +59,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         UserError: the file system refuses; ``path`` is as it was.
     """
-    partial = path.with_name(f".{path.stem}{_PARTIAL}{path.suffix}")
+    partial = _partial(path)
     with user_errors(path):
         try:
             yield partial
@@ -77,6 +91,10 @@ def replacing_folder(path: Path) -> Iterator[Path]:
             shutil.rmtree(partial, ignore_errors=True)
 
 
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.stem}{_PARTIAL}{path.suffix}")
+
+
 def is_partial(path: Path) -> bool:
     """Return whether the name is that of a file or folder that a kill left incomplete."""
     return path.name.startswith(".") and _PARTIAL in path.name
@@ -101,6 +119,7 @@ def refusal(path: Path, error: OSError) -> str:
         errno.EPERM: "choose a folder that can be written, with --out",
         errno.ENOTDIR: "choose another folder with --out",
         errno.EEXIST: "choose another folder with --out",
+        errno.EISDIR: "give the name of a file with --out",
     }
     remedy = remedies.get(error.errno or 0)
     return f"cannot write {path}: {error.strerror or error}" + (f"; {remedy}" if remedy else "")

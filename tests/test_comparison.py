@@ -20,6 +20,7 @@ import pytest
 from qdos_brax import experiment
 from qdos_brax.analysis import inside
 from qdos_brax.commands import train as train_command
+from qdos_brax.config.task import make_task
 from qdos_brax.errors import UserError
 from qdos_brax.population import memory
 from qdos_brax.runs import comparison
@@ -97,7 +98,7 @@ def test_killed_comparison_goes_on_exactly(
 def test_alpha_is_not_scanned_where_it_weighs_nothing(tmp_path: Path, built: list[str]) -> None:
     flags = shlex.split(f"{command()} --alpha 0.1,0.3")
     configs = train_command.configs_from_args(train_command.train_parser().parse_args(flags))
-    env = experiment._make_env(configs["qdos"])
+    env = make_task(configs["qdos"].env, "mujoco")
     alphas = [experiment._resolved(config, env, tmp_path).skills.alpha for config in configs.values()]
     assert alphas == [(0.1, 0.3), 0.0]
 

@@ -119,4 +119,4 @@ def with_alpha(method: str, alpha: Any) -> str:
 def listed(values: Any) -> str:
     """Return one number or text, or several separated by commas."""
     each = values if isinstance(values, tuple) else (values,)
-    return ", ".join(value if isinstance(value, str) else f"{value:g}" for value in each)
+    return ", ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in each)

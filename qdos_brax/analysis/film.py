@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import envs
 from envs.render import NoOpenGL, Renderer, steps_per_second
 from qdos_brax.analysis.finished import TrainedRun, evaluation_key, load_run
+from qdos_brax.config.task import make_task
 from qdos_brax.errors import UserError
 from qdos_brax.methods.learners_view import learners_env
 from qdos_brax.report.video import mp4
@@ -131,7 +131,7 @@ def _seen(state: Any, decision: jax.Array | None) -> Moment:
 
 def on_mujoco_c(trained: TrainedRun) -> TrainedRun:
     """Return the run with its task on MuJoCo C: a few episodes are not worth MJX's compilation."""
-    return trained._replace(env=learners_env(trained.config, envs.make(trained.config.env, physics="mujoco")))
+    return trained._replace(env=learners_env(trained.config, make_task(trained.config.env, "mujoco")))
 
 
 def of_member(trained: TrainedRun, member: int) -> tuple[Any, Any]:

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from flax.errors import FlaxError
 
-import envs
 from qdos_brax import config as configs
 from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
+from qdos_brax.config.task import make_task
 from qdos_brax.data.device import Normaliser
 from qdos_brax.errors import UserError
 from qdos_brax.high_level.agent import Agent, Policy
@@ -56,7 +56,8 @@ def load_run(run: Path) -> TrainedRun:
         run: the run folder or the file.
 
     Raises:
-        UserError: it is neither, the run has not finished, or the file cannot be trusted.
+        UserError: it is neither, the run has not finished, the file cannot be trusted, or this machine does not have
+            the task or its engine.
     """
     if run.is_file():
         return _exported_run(run)
@@ -64,16 +65,13 @@ def load_run(run: Path) -> TrainedRun:
     config = configs.from_yaml(folder.config)
     if folder.read_summary() is None:
         raise UserError(f"the run in {run} has not finished; continue it with: {resume_command(run)}")
-    env = envs.make(config.env, physics=config.physics)
+    env = make_task(config.env, config.physics)
     return trained_run(config, env, final_artifacts(folder.checkpoints, configs.config_hash(config)))
 
 
 def _exported_run(path: Path) -> TrainedRun:
     config, found = read_export(path)
-    try:
-        env = envs.make(config.env, physics=config.physics)
-    except ValueError as error:  # a task or an engine that this machine does not have
-        raise UserError(f"{path}: {error}") from error
+    env = make_task(config.env, config.physics)
     trained = trained_run(config, env, found.arrays)
     try:
         jax.eval_shape(lambda: _decide(trained))

@@ -17,6 +17,7 @@ from qdos_brax.collection.makers import maker_of
 from qdos_brax.data import formats
 from qdos_brax.data.cache import folder, locked
 from qdos_brax.data.quality import QUALITY
+from qdos_brax.files import try_to_write
 from qdos_brax.runs.progress import Progress
 
 
@@ -63,6 +64,7 @@ def make_file(path: Path, collector: EpisodeCollector, transitions: int, seed: i
         UserError: an argument is out of range, or the file cannot be written.
     """
     check_size(transitions, seed, num_envs)  # before the bar appears
+    try_to_write(path)  # before the work
     with Progress("collect", transitions) as bar:
 
         def report(done: int, total: int) -> None:

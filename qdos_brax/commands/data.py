@@ -13,6 +13,7 @@ from qdos_brax.collection import recipes
 from qdos_brax.collection.default_set import make_file
 from qdos_brax.collection.makers import CollectorMaker, maker_of
 from qdos_brax.config import Config, check_method, load_config
+from qdos_brax.config.task import make_task
 from qdos_brax.data import checks, download, formats, sources
 from qdos_brax.data.dataset import episode_bounds
 from qdos_brax.data.quality import QUALITY
@@ -98,7 +99,7 @@ def _make(args: argparse.Namespace) -> int:
     path = Path(args.out).expanduser()
     if path.suffix not in (".hdf5", ".h5"):
         raise UserError(f"--out {args.out}: data is written as .hdf5; give the file that ending")
-    env = _env(args.task, args.physics)
+    env = make_task(args.task, args.physics)
     maker = maker_of(env)
     make_file(
         path, maker.collector(_recipe(args, maker, env.spec.full_name)), args.transitions, args.seed, args.num_envs
@@ -154,7 +155,7 @@ def _info(args: argparse.Namespace) -> int:
         task = args.env or attributes.get("env")
         if not task:
             raise UserError(f"{path} does not name the task it was made for; give it with --env")
-        _draw_map(args.map, rows, _env(str(task), "mujoco"), path.name)
+        _draw_map(args.map, rows, make_task(str(task), "mujoco"), path.name)
     return 0
 
 
@@ -178,7 +179,7 @@ def _check(args: argparse.Namespace) -> int:
     given = {key: value for key, value in flags.items() if value is not None}
     config = load_config(args.env, args.preset, given, args.set)
     check_method(config)
-    env = _env(args.env, "mujoco")
+    env = make_task(args.env, "mujoco")
     path = download.resolve(args.file).path
     rows = formats.load(path, env.jump)
     found = checks.inspect(rows, env, config, formats.read_attrs(path), str(path))
@@ -204,7 +205,7 @@ def _check(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
     from qdos_brax.data.minari_export import export_minari  # here, since importing gymnasium takes a while
 
-    env = _env(args.env, "mujoco")
+    env = make_task(args.env, "mujoco")
     dataset = formats.read(download.resolve(args.file).path, env)
     export_minari(dataset, Path(args.out).expanduser(), env.spec.full_name)
     print(args.out)
@@ -218,10 +219,3 @@ def _draw_map(out: str, rows: Rows, env: envs.Task, title: str) -> None:
         raise UserError(f"a map needs the simulator states (qpos) of {env.spec.name}, which this file does not hold")
     draw_coverage(rows.qpos, env, Path(out), f"{title}, {env.spec.full_name}")
     print(out)
-
-
-def _env(name: str, physics: str) -> envs.Task:
-    try:
-        return envs.make(name, physics=physics)
-    except ValueError as error:  # envs does not know UserError; its messages are written for the user too
-        raise UserError(str(error)) from None

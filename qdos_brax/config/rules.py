@@ -149,9 +149,9 @@ def listed_in(key: str, value: Any, rule: Rule) -> tuple[float | str, ...]:
     return tuple(_number_or_auto(key, item, rule) for item in _some(key, _items(value)))
 
 
-def values_in(key: str, value: Any, whole: bool = False) -> tuple[float, ...]:
+def values_in(key: str, value: Any) -> tuple[float, ...]:
     """Return the numbers that ``value`` lists, or its one number, whatever the key's range."""
-    return tuple(_number_in(key, item, Rule("float"), whole) for item in _some(key, _items(value)))
+    return tuple(_number_in(key, item, Rule("float")) for item in _some(key, _items(value)))
 
 
 def choices_in(key: str, value: Any, rule: Rule) -> list[Any]:

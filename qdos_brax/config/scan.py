@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from qdos_brax.config.rules import AUTO, Rule, listed_in, values_in
+from qdos_brax.config.rules import AUTO, Rule, convert, listed_in, values_in
 from qdos_brax.config.run_groups import ScanConfig
-from qdos_brax.config.schema import Config, get, labelled, leaves
+from qdos_brax.config.schema import Config, get, get_field, labelled, leaves
 from qdos_brax.errors import UserError
 
 _DISTRIBUTION = re.compile(r"\s*(\w+)\s*\(([^(),]*),([^(),]*)\)\s*")
@@ -125,14 +125,14 @@ def drawn(values: Mapping[str, Any]) -> dict[str, Any]:
     scannable = [key for key, field in leaves(Config) if field.metadata["scan"] and key in values]
     written = {key: distribution(key, values[key]) for key in scannable}
     wanted = {key: found for key, found in written.items() if found is not None}
-    count = values_in("scan.samples", values.get("scan.samples", 0), whole=True)[0]
+    count = convert("scan.samples", values.get("scan.samples", 0), get_field("scan.samples"))
     if not count:
         for key in wanted:
             raise UserError(f"{key}={values[key]} is drawn from with --sample N; give N")
         return dict(values)
     if values.get("scan.combine", ScanConfig.combine) != ScanConfig.combine:
         raise UserError("--sample draws its own settings; leave out --zip")
-    seed = int(values_in("scan.draw_seed", values.get("scan.draw_seed", 0), whole=True)[0])
+    seed = convert("scan.draw_seed", values.get("scan.draw_seed", 0), get_field("scan.draw_seed"))
     streams: dict[str, Iterator[float | str]] = {}
     for key in scannable:
         stream = np.random.default_rng([seed, zlib.crc32(key.encode())])
@@ -143,12 +143,12 @@ def drawn(values: Mapping[str, Any]) -> dict[str, Any]:
     if not streams:
         raise UserError("--sample has nothing to draw; give a key as --set 'skills.alpha=loguniform(0.1,3)' or a list")
     settings: dict[tuple[float | str, ...], None] = {}
-    for _ in range(_DRAWS_PER_SETTING * int(count)):
+    for _ in range(_DRAWS_PER_SETTING * count):
         if len(settings) == count:
             break
         settings[tuple(next(stream) for stream in streams.values())] = None
     if len(settings) < count:
-        raise UserError(f"--sample {int(count)} asks for more settings than there are ({len(settings)})")
+        raise UserError(f"--sample {count} asks for more settings than there are ({len(settings)})")
     columns = zip(*settings, strict=True)
     return {**values, **{key: list(column) for key, column in zip(streams, columns, strict=True)}}
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import jax
 import matplotlib.image
 
-import envs
 from envs.render import NoOpenGL, Renderer
+from qdos_brax.config.task import make_task
 from qdos_brax.errors import UserError
 from qdos_brax.files import user_errors
 
@@ -25,11 +25,11 @@ def draw_task(name: str, out: Path) -> None:
     """
     check_name(out)
     try:
-        env = envs.make(name, physics="mujoco")
+        env = make_task(name, "mujoco")
         state = env.reset(jax.random.key(0))
         with Renderer(env, height=720) as renderer:
             image = renderer.frame(state.pipeline_state.qpos, state.info["goal"])
-    except (ValueError, NoOpenGL) as error:  # envs knows nothing of UserError; its lines are made for the user
+    except NoOpenGL as error:
         raise UserError(str(error)) from error
     with user_errors(out):
         matplotlib.image.imsave(out, image)

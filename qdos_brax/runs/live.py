@@ -49,7 +49,7 @@ class MemberBoard:
             table.add_column(name.rpartition(".")[2].replace("_", " "), justify="right", no_wrap=True)
         for member, latest, loss in zip(self._members, self._latest, self._loss, strict=True):
             values = [member[name] for name in self._names]
-            cells = [value if isinstance(value, str) else f"{value:g}" for value in values]
+            cells = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
             cells += [f"{latest[column]:,.4g}" if column in latest else "" for column in shown.values()]
             frozen = latest.get("status_ok") == 0
             table.add_row(*cells, loss, "frozen" if frozen else "", style="red" if frozen else "")

@@ -52,6 +52,10 @@ def test_the_default_set_is_collected_once(
     assert recipes.parse_mix(attributes["mix"]).keys() == recipes.BEHAVIOURS.keys()
     assert attributes["expert"] == policies.digest(StandIn())
 
+    with monkeypatch.context() as patch, pytest.raises(UserError, match="give the name of a file with --out"):
+        patch.setattr(default_set, "collect", None)  # refused before anything is collected
+        default_set.make_file(tmp_path / "data", Collector(env, recipes.degraded(0.5, profiles.ANT)), 400, 0, 2)
+
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("QDOS_DATA", str(tmp_path / "file"))
     with pytest.raises(UserError, match="QDOS_DATA"):

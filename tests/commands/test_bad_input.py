@@ -14,6 +14,7 @@ import pytest
 
 from qdos_brax.commands.main import main
 from qdos_brax.commands.train import train_main
+from qdos_brax.config import load_config, to_yaml
 from qdos_brax.data import cache
 from qdos_brax.runs import comparison
 from tests.runs import toy
@@ -44,6 +45,8 @@ TRAIN = [
     f"{START} --physics bullet",
     f"{START} --method nosuch",
     f"{START} --method qdos,qdos",
+    f"{START} --alpha 0.1,0.2 --sample -1",
+    f"{START} --alpha 0.1,0.2 --sample 2 --set scan.draw_seed=-1",
     f"{START} --set skills.alhpa=1",
     f"{START} --set skills",
     f"{START} --set skills.horizon=0",
@@ -77,6 +80,8 @@ OTHERS = [
     "evaluate {run} --episodes x",
     "evaluate {run} {run} --video {new}.mp4",
     "evaluate {half_summary}",
+    "evaluate {others_task}",
+    "evaluate {others_engine}",
     "report",
     "report /nowhere",
     "report {thesis}",
@@ -106,6 +111,8 @@ OTHERS = [
     "data fetch nosuch",
     "data make antmaze-medium --out {new}.npz",
     "data make nosuch --out {new}.hdf5",
+    "data make antmaze-medium --out {folder}",
+    "data make antmaze-medium --out {file}/new.hdf5",
     "data make antmaze-medium --out {new}.hdf5 --transitions 3",
     "data make antmaze-medium --out {new}.hdf5 --degraded-share 2",
     "data make antmaze-medium --out {new}.hdf5 --mix expert=0.5,nosuch=0.5",
@@ -125,6 +132,8 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     found["truncated"] = found.pop("truncated.npz")
     found["truncated"].write_bytes(content[: len(content) // 2])
     found["sound"] = SOUND
+    found["folder"] = root / "folder.hdf5"
+    found["folder"].mkdir()
     comparison.create(found["comparison"], {"qdos": "env: antmaze-medium-task1\n"})
     damaged: dict[str, tuple[str, str | None]] = {
         "unfinished": ("summary.json", None),
@@ -140,6 +149,15 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         (found[name] / file).unlink()
         if text is not None:
             (found[name] / file).write_text(text)
+    written = to_yaml(load_config("antmaze-medium", "smoke"))
+    elsewhere = {
+        "others_task": written.replace("env: antmaze-medium\n", "env: reacher-task1\n"),
+        "others_engine": written.replace("physics: auto\n", "physics: mjx-warp\n"),
+    }
+    for name, text in elsewhere.items():
+        assert text != written
+        found[name] = shutil.copytree(found["run"], root / name)
+        (found[name] / "config.yaml").write_text(text)
     found["damaged_comparison"] = shutil.copytree(found["comparison"], root / "damaged_comparison")
     (found["damaged_comparison"] / "comparison.json").write_text('{"methods"')
     return found
