@@ -75,7 +75,9 @@ class DiveOffConfig:
     autoencoder_updates: int = count(
         10_000, "first gradient steps, without weights and without the information term", low=0
     )
-    updates: int = count(1_000_000, "gradient steps", pretrain=True)
+    updates: int = count(
+        1_000_000, "gradient steps of actor and autoencoder; critics make two each time", pretrain=True
+    )
 
 
 @dataclasses.dataclass(frozen=True)

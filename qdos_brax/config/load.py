@@ -138,8 +138,20 @@ def check_method(config: Config) -> None:
             f"high_level.initial={high.initial} learns from the data's rewards: labels.offline_reward must be data, "
             f"not {config.labels.offline_reward}"
         )
+    if method.offline and config.labels.offline_reward != "data":
+        raise UserError(
+            f"{config.method} learns offline from the data's rewards: labels.offline_reward must be data, "
+            f"not {config.labels.offline_reward}"
+        )
     if config.tuning.skills != "frozen" and method.low_level != "trajectory":
         raise UserError(f"{config.method} has no trajectory skills to fine-tune: tuning.skills must stay frozen")
+    least, tuning = 4.0, config.tuning  # episodes within the window; the guard counts three before it prefers any
+    if tuning.skills != "frozen" and tuning.window * tuning.trial_share < least:
+        raise UserError(
+            f"tuning.window={tuning.window} and tuning.trial_share={tuning.trial_share:g} leave "
+            f"{tuning.window * tuning.trial_share:g} episodes to compare the tuned skills by, too few for them ever to "
+            f"be played; their product must be at least {least:g}"
+        )
     if high.utd % high.actor_updates:
         raise UserError(
             f"high_level.utd ({high.utd}) must be a multiple of high_level.actor_updates ({high.actor_updates}): the "

@@ -232,7 +232,13 @@ METHODS = {
     "diveoff": Method(
         "latents of single transitions, good and diverse, as skills (DiveOff, Osa and Harada 2024)",
         low_level="transition",
-        settings={"skills.latent_dim": 2, "skills.latent_box": 2.0, "high_level.latent_map": "box"},
+        # The published 10^6 updates are those of the critics, which make two per update here.
+        settings={
+            "skills.latent_dim": 2,
+            "skills.latent_box": 2.0,
+            "high_level.latent_map": "box",
+            "diveoff.updates": 500_000,
+        },
     ),
 }
 

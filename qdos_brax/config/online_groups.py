@@ -70,7 +70,7 @@ class HighLevelConfig:
     actor_average: Scannable = number(
         1.0,
         "evaluations and the finished run play a running mean of the actor, which goes this share of the way to it "
-        "after each macro step; 1 is the actor itself",
+        "after each macro step of all environments; 1 is the actor itself",
         high=1.0,
         above=True,
     )

@@ -83,12 +83,12 @@ class ValuesConfig:
     )
     hidden: tuple[int, ...] = widths((256, 256), "hidden layers of V and Q, and of the advantage of skills")
     learning_rate: Scannable = rate(3e-4, "Adam learning rate of V, Q and the advantage of skills")
-    batch_size: int = count(256, "(iql) transitions per gradient step")
+    batch_size: int = count(256, "(iql) transitions per gradient step; the method iql has policy.batch_size")
     expectile: Scannable = number(0.9, "(iql) expectile tau of the regression of V", high=1.0, above=True)
     discount: Scannable = number(0.99, "(iql) discount per environment step", high=1.0)
     target_rate: Scannable = number(0.005, "(iql) Polyak rate of the target critic", high=1.0, above=True)
-    n_step: int = count(10, "(iql) environment steps of the bootstrapped return")
-    updates: int = count(100_000, "(iql) gradient steps", pretrain=True)
+    n_step: int = count(10, "(iql) environment steps of the bootstrapped return; the method iql takes one")
+    updates: int = count(100_000, "(iql) gradient steps; the method iql has policy.updates", pretrain=True)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -139,7 +139,10 @@ class Learning:
         return rows._replace(reward=reward, mask=mask)
 
     def _learn_rewards(self, learners: Learners, key: jax.Array, active: jax.Array, sources: Sources) -> Learners:
-        """Make as many steps of the labeller as of the critics, on as many online rows (SUPE's, ExPLORe's code)."""
+        """Make as many steps of the labeller as of the critics (SUPE's, ExPLORe's code), on a batch's online rows.
+
+        ExPLORe's code gives its reward model as many rows as the critics have in all, of which half are online.
+        """
         rate, online = sources.hyper["labels.reward_learning_rate"], self._config.batch_size - self._offline
 
         def step(labeller: Any, key: jax.Array) -> tuple[Any, None]:

@@ -5,12 +5,15 @@ actions weighted by exp(scale A), with A(s, a, z) = Q(s, a, z) - Q(s, pi(s, z), 
 the information term makes z readable from what the actor does with it: z uniform in a box, decoded along logged
 states, encoded again. Numbers follow the authors' code (github.com/TakaOsa/DiveOff, train.py): z of dimension 2 from
 [-2, 2], scale 3, weights at most 100, KL weight 50, information 2, learning rate 3e-4, the autoencoder's 0.3 of that,
-batch 256, two critic steps per actor step, 10^4 first updates of the autoencoder alone, 10^6 updates. Their KL weight
-lets the posterior collapse (in the task of tests/offline/test_diveoff.py every z then plays the mean of the solutions);
-0.1 does not.
+batch 256, two critic steps per actor step, 10^6 critic steps (here ``updates`` are the actor's, half as many). Their KL
+weight lets the posterior collapse (in the task of tests/offline/test_diveoff.py every z then plays the mean of the
+solutions); 0.1 does not.
 
-Two places differ from that code: the weight of a transition in the autoencoder's loss is its own, not another batch's,
-and the target's action has the policy's narrow spread, not 1. Its cosine decay of learning rates is left out.
+What differs from that code: the weight of a transition in the autoencoder's loss is its own, not another batch's; the
+target's action has the policy's narrow spread, not 1; in the first 10^4 updates actor and critics learn beside the
+autoencoder, which does so at its later rate, while there it learns alone at the full one; the weight of the posterior's
+sharpness is 0 in them and exp(A) afterwards, there exp(v A) with v from 0 to 1 along a cosine over the first half of
+all steps. Its cosine decay of learning rates is left out.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from qdos_brax.high_level.evaluation import Episodes, evaluate, summary
 from qdos_brax.offline.learner import Learner
 from qdos_brax.population import health
 from qdos_brax.population.members import Population
-from qdos_brax.population.phase import MemberPhase
+from qdos_brax.population.phase import MemberPhase, even_chunks
 
 
 class OfflinePhaseState(struct.PyTreeNode):
@@ -63,7 +63,7 @@ class OfflinePhase(MemberPhase):
         evaluation: of a policy, or None.
         reads: what the learner reads of the artifacts, as a field of the data: ("labels",) or nothing.
         drops: what no later phase reads.
-        updates_per_chunk: gradient steps between two looks of the host.
+        updates_per_chunk: gradient steps between two looks of the host, at most.
     """
 
     def __init__(
@@ -78,8 +78,8 @@ class OfflinePhase(MemberPhase):
         updates_per_chunk: int = 500,
     ) -> None:
         every = updates if evaluation is None else evaluation.every_updates
-        self._updates = min(updates_per_chunk, updates, every)
-        super().__init__(name, "pretrain", -(-updates // self._updates))
+        chunks, self._updates = even_chunks(updates, min(updates_per_chunk, every))
+        super().__init__(name, "pretrain", chunks)
         self._learner, self._normalise, self._evaluation = learner, normaliser, evaluation
         self._reads, self._drops = reads, drops
         self._evaluate_every = max(1, round(every / self._updates))
@@ -92,7 +92,7 @@ class OfflinePhase(MemberPhase):
             self._evaluate = population.program(lambda params, key, _: evaluation(params, key))
 
     def chunk(self, state: OfflinePhaseState, constants: Any) -> tuple[OfflinePhaseState, dict[str, Any]]:
-        """Make ``updates_per_chunk`` gradient steps, and an evaluation when one is due (always after the last)."""
+        """Make a chunk's gradient steps, and an evaluation when one is due (always after the last)."""
         state, metrics = super().chunk(state, constants)
         chunk = int(metrics["update"][0]) // self._updates
         if self._evaluation is not None and (chunk % self._evaluate_every == 0 or chunk == self.num_chunks):
@@ -124,7 +124,7 @@ class OfflinePhase(MemberPhase):
     def train_member(
         self, state: OfflinePhaseState, constants: dict[str, Any], hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[OfflinePhaseState, dict[str, jax.Array]]:
-        """Make ``updates_per_chunk`` gradient steps."""
+        """Make a chunk's gradient steps."""
         data = data.replace(**constants)
 
         def update(learner: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:

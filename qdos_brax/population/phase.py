@@ -12,6 +12,16 @@ from qdos_brax.population.members import Population
 from qdos_brax.population.memory import working_bytes
 
 
+def even_chunks(total: int, most: int) -> tuple[int, int]:
+    """Return (chunks, steps of each) for ``total`` steps, of at most ``most`` each.
+
+    They are alike, for they are one program, so that a total that they do not divide is passed: by less than one step
+    per chunk.
+    """
+    chunks = -(-total // most)
+    return chunks, -(-total // chunks)
+
+
 class MemberPhase:
     """Run two programs that are written for one member, ``start_member`` and ``train_member``, for all members.
 

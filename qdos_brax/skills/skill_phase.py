@@ -19,7 +19,7 @@ from qdos_brax.data.segments import window
 from qdos_brax.nn.optim import ADAM, adam_step, rate_schedule
 from qdos_brax.population import health
 from qdos_brax.population.members import Population
-from qdos_brax.population.phase import MemberPhase
+from qdos_brax.population.phase import MemberPhase, even_chunks
 from qdos_brax.skills.alpha import AdaptiveAlpha, Alpha, FixedAlpha, unreadable_share
 from qdos_brax.skills.information_terms import InformationTerm, Rollout
 from qdos_brax.skills.latent_map import Prior, latent_map
@@ -89,10 +89,12 @@ class SkillPhase(MemberPhase):
         self._model, self._weights, self._information = model, weights, information
         self._alpha: Alpha = AdaptiveAlpha() if asks_auto(config.skills.alpha) else FixedAlpha()
         self._finds_temperature = asks_auto(config.skills.advantage_temperature)
-        total_blocks = -(-self._skills.updates // self._skills.mi_every)
-        self._rate = rate_schedule(self._skills.schedule, total_blocks * self._skills.mi_every)
-        self._blocks = min(blocks_per_chunk, total_blocks, max(1, _UPDATES_PER_CHUNK // self._skills.mi_every))
-        super().__init__("skills", "pretrain", -(-total_blocks // self._blocks))
+        every = self._skills.mi_every
+        chunks, self._blocks = even_chunks(
+            -(-self._skills.updates // every), min(blocks_per_chunk, max(1, _UPDATES_PER_CHUNK // every))
+        )
+        self._rate = rate_schedule(self._skills.schedule, chunks * self._blocks * every)
+        super().__init__("skills", "pretrain", chunks)
 
     def bind(self, population: Population, data: DeviceData) -> None:
         """Compile the programs, that of the weights' temperature included."""
@@ -137,7 +139,7 @@ class SkillPhase(MemberPhase):
     def train_member(
         self, state: SkillPhaseState, constants: dict[str, Any], hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[SkillPhaseState, dict[str, jax.Array]]:
-        """Make ``blocks_per_chunk`` x ``mi_every`` gradient steps."""
+        """Make a chunk's gradient steps."""
         keys = jax.random.split(state.key, self._blocks + 1)
         block = partial(self._block, data=data, hyper=hyper, artifacts=constants)
         after, info = jax.lax.scan(block, state, keys[1:])

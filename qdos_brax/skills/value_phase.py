@@ -15,7 +15,7 @@ from qdos_brax.data.device import DeviceData
 from qdos_brax.data.segments import macro_return, window
 from qdos_brax.population import health
 from qdos_brax.population.members import Population
-from qdos_brax.population.phase import MemberPhase
+from qdos_brax.population.phase import MemberPhase, even_chunks
 from qdos_brax.skills.values import IQL, ValueBatch, ValueHyper, ValueState
 from qdos_brax.skills.weights import scaled_advantage, segment_advantage, transition_advantage
 
@@ -39,15 +39,15 @@ class ValuePhase(MemberPhase):
     Args:
         config: the run's configuration.
         iql: the learner.
-        updates_per_chunk: gradient steps between two looks of the host.
+        updates_per_chunk: gradient steps between two looks of the host, at most.
     """
 
     def __init__(self, config: Config, iql: IQL, updates_per_chunk: int = 500) -> None:
         self._values: ValuesConfig = config.values
         self._skills: SkillsConfig = config.skills
         self._iql = iql
-        self._updates = min(updates_per_chunk, config.values.updates)
-        super().__init__("values", "pretrain", -(-config.values.updates // self._updates))
+        chunks, self._updates = even_chunks(config.values.updates, updates_per_chunk)
+        super().__init__("values", "pretrain", chunks)
 
     def bind(self, population: Population, data: DeviceData) -> None:
         """Compile the programs, that of the advantages included."""
@@ -67,7 +67,7 @@ class ValuePhase(MemberPhase):
     def train_member(
         self, state: ValuePhaseState, constants: dict[str, Any], hyper: dict[str, jax.Array], data: DeviceData
     ) -> tuple[ValuePhaseState, dict[str, jax.Array]]:
-        """Make ``updates_per_chunk`` gradient steps."""
+        """Make a chunk's gradient steps."""
         value_hyper = ValueHyper(hyper["values.learning_rate"], hyper["values.expectile"], hyper["values.target_rate"])
 
         def update(values: ValueState, key: jax.Array) -> tuple[ValueState, dict[str, jax.Array]]:

@@ -206,6 +206,12 @@ def test_settings_must_suit_the_method() -> None:
         configs.check_method(load_config("antmaze", "smoke", {"method": "fql", "high_level.initial": "iql"}))
     with pytest.raises(UserError, match=r"initial=iql learns from the data's rewards.*must be data, not min"):
         configs.check_method(load_config("antmaze", "smoke", {"method": "supe", "high_level.initial": "iql"}))
+    with pytest.raises(UserError, match=r"qc learns offline from the data's rewards: labels.*must be data, not min"):
+        configs.check_method(load_config("antmaze", "smoke", {"method": "qc", "labels.offline_reward": "min"}))
+    tuned = {"tuning.skills": "guarded", "tuning.window": 8}
+    with pytest.raises(UserError, match=r"tuning\.window=8 and tuning\.trial_share=0\.25 leave 2 episodes"):
+        configs.check_method(load_config("antmaze", "smoke", tuned))
+    configs.check_method(load_config("antmaze", "smoke", {**tuned, "tuning.window": 16}))
     updates = {"high_level.utd": 10, "high_level.actor_updates": 4}
     with pytest.raises(UserError, match=r"utd \(10\) must be a multiple of high_level\.actor_updates \(4\)"):
         configs.check_method(load_config("antmaze", "smoke", updates))

@@ -16,6 +16,7 @@ import pytest
 
 from qdos_brax.population import memory
 from qdos_brax.population.members import Population
+from qdos_brax.population.phase import even_chunks
 from qdos_brax.runs import shares
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import read_rows
@@ -202,3 +203,11 @@ def test_two_processes_train_the_members_of_one_and_go_on_after_a_kill(tmp_path:
 
 def launch(flags: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, str(ROOT / "train.py"), *flags.split()], cwd=ROOT)
+
+
+@pytest.mark.parametrize(
+    ("total", "most", "expected"),
+    [(1_000, 500, (2, 500)), (600, 500, (2, 300)), (5, 500, (1, 5)), (601, 500, (2, 301)), (15, 2, (8, 2))],
+)
+def test_chunks_are_alike_and_hardly_pass_the_total(total: int, most: int, expected: tuple[int, int]) -> None:
+    assert even_chunks(total, most) == expected
