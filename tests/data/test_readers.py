@@ -59,6 +59,20 @@ def test_every_layout_of_ogbench_is_the_same_data(
     assert rows.size == 22 and rows.notes == []
 
 
+@pytest.mark.parametrize("number", [np.nan, 0.5])
+def test_a_discrete_state_is_whole_numbers(tmp_path: Path, number: float) -> None:
+    """Rewards of scene and kitchen are counted from it."""
+    with np.load(OGBENCH) as file:
+        buttons = np.zeros((len(file["actions"]), 2))
+        buttons[5, 1] = number
+        np.savez(tmp_path / "set.npz", **file, button_states=buttons)
+    with pytest.raises(UserError, match="'button_states' holds a number that is not whole, in row 5"):
+        formats.load(tmp_path / "set.npz")
+    columns = d4rl_antmaze() | {"infos/extra": np.full((24, 1), number)}
+    with pytest.raises(UserError, match="'infos/extra' holds a number that is not whole, in row 0"):
+        formats.load(write_d4rl(tmp_path / "a.hdf5", columns))
+
+
 def test_valids_and_terminals_must_agree(tmp_path: Path) -> None:
     compact = load_dataset(str(OGBENCH), compact_dataset=True, add_info=True)
     compact["terminals"][4] = 1.0

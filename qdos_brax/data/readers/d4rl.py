@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qdos_brax.data.readers.rows import Rows, after_action
+from qdos_brax.data.readers.rows import Rows, after_action, discrete
 from qdos_brax.data.readers.table import DataTable
 
 _OPTIONAL = ("next_observations", "rewards", "timeouts", "infos/qpos", "infos/qvel", "infos/extra", "infos/quality")
@@ -89,7 +89,7 @@ def load(table: DataTable, jump: float | None) -> Rows:
         if f"infos/{key}" in table:
             setattr(rows, key, table.floats(f"infos/{key}", keep)[0])
     if "infos/extra" in table:
-        rows.extra = np.round(table.floats("infos/extra", keep)[0]).astype(np.int32)
+        rows.extra = discrete(table.path, "infos/extra", table.floats("infos/extra", keep)[0])
     if "rewards" in table:
         rows.rewards = table.numbers("rewards", keep)
     if "infos/quality" in table:

@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from qdos_brax.data.readers.rows import Rows, after_action, unreadable
+from qdos_brax.data.readers.rows import Rows, after_action, discrete, unreadable
 from qdos_brax.data.readers.table import NUMERIC
 from qdos_brax.errors import UserError
 
@@ -142,7 +142,8 @@ def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: sli
         if len(values) not in (length, length + 1):
             raise UserError(f"{path}: {name} has {len(values)} rows of {_INFOS[field]}: the file is damaged")
         values = values[:length]  # one more in today's files, where reset's info comes first
-        getattr(rows, field)[part] = np.round(values) if field in _INTEGERS else values
+        whole = field in _INTEGERS
+        getattr(rows, field)[part] = discrete(path, f"{name}/{_INFOS[field]}", values) if whole else values
 
 
 def _observations(item: Any) -> np.ndarray:

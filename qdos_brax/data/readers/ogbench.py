@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qdos_brax.data.readers.rows import Rows
+from qdos_brax.data.readers.rows import Rows, discrete
 from qdos_brax.data.readers.table import DataTable
 from qdos_brax.errors import UserError
 
@@ -45,7 +45,7 @@ def load(table: DataTable) -> Rows:
         if key in table:
             setattr(rows, key, table.floats(key, keep)[0])
     if "button_states" in table:  # the scene's discrete state; other buttons are no task here
-        rows.extra = np.round(table.floats("button_states", keep)[0]).astype(np.int32)
+        rows.extra = discrete(table.path, "button_states", table.floats("button_states", keep)[0])
     if "rewards" in table:
         rows.rewards = table.numbers("rewards", keep)
     if "masks" in table:

@@ -91,6 +91,19 @@ def unreadable(path: Path) -> Iterator[None]:
         raise UserError(f"{path}: cannot be read as .npz or .hdf5 (truncated or another format): {reason}") from None
 
 
+def discrete(path: Path, key: str, values: np.ndarray) -> np.ndarray:
+    """Return a discrete state as int32, of the shape of ``values``.
+
+    Raises:
+        UserError: it holds numbers that are not whole: rewards are counted from it.
+    """
+    whole = np.round(values)
+    if not np.array_equal(whole, values):  # nan equals nothing
+        row = int(np.flatnonzero((whole != values).reshape(len(values), -1).any(axis=1))[0])
+        raise UserError(f"{path}: {key!r} holds a number that is not whole, in row {row}: no discrete state")
+    return whole.astype(np.int32)
+
+
 def after_action(path: Path, rows: Rows) -> None:
     """Replace simulator states that were stored after the action, as D4RL's ant mazes have them, in place.
 
