@@ -18,6 +18,7 @@ from qdos_brax.analysis.finished import TrainedRun, evaluation_key
 from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import Normaliser
+from qdos_brax.data.exchange import exchanged
 from qdos_brax.data.segments import segment_starts
 from qdos_brax.files import write_arrays
 from qdos_brax.methods.learners_view import learners_observations
@@ -62,7 +63,7 @@ def look_inside(trained: TrainedRun, dataset: Dataset, out: Path) -> None:
 
     Args:
         trained: the run.
-        dataset: its data.
+        dataset: its data, as logged.
         out: the file, ending in .npz.
 
     Raises:
@@ -96,7 +97,7 @@ class _Sample(NamedTuple):
     """Hold a sample of the segments of a run's data.
 
     Attributes:
-        dataset: the data.
+        dataset: the data that the run learned from: its weights are of these rows.
         chosen: int[n], the indices of the segments among all segments.
         rows: int[n, H], their rows.
     """
@@ -107,8 +108,9 @@ class _Sample(NamedTuple):
 
 
 def _sample(trained: TrainedRun, dataset: Dataset) -> _Sample:
-    """Draw random segments, the same ones for every method on the same data."""
-    horizon = trained.config.skills.horizon
+    """Draw random segments of what the run learned from, the same ones for every method on the same data."""
+    horizon, exchange = trained.config.skills.horizon, trained.config.exchange
+    dataset = exchanged(dataset, trained.env, exchange.share, exchange.seed)
     starts = segment_starts(dataset.ends, horizon)
     chosen = np.sort(np.random.default_rng(_SEED).choice(len(starts), min(_SEGMENTS, len(starts)), replace=False))
     return _Sample(dataset, chosen, starts[chosen][:, None] + np.arange(horizon))

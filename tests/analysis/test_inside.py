@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -61,6 +62,20 @@ def analysed(finished: Path, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> 
     trained = trained._replace(artifacts=trained.artifacts | {"advantage": advantage})
     inside.look_inside(trained, data, finished / "inside.npz")
     return finished
+
+
+def test_segments_are_of_the_data_that_was_learned_from(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights of exchanged episodes stand beside the returns of these, not of the logged ones."""
+    exchange, env = SimpleNamespace(share=0.5, seed=3), SimpleNamespace()
+
+    def exchanged(*given: Any) -> Dataset:
+        assert given == (data, env, 0.5, 3)
+        return replace(data, rewards=np.zeros(SIZE, np.float32))
+
+    monkeypatch.setattr(inside, "exchanged", exchanged)
+    config = SimpleNamespace(skills=SimpleNamespace(horizon=HORIZON), exchange=exchange)
+    sample = inside._sample(SimpleNamespace(env=env, config=config), data)  # type: ignore[arg-type]
+    assert len(sample.chosen) == 3 * (20 - HORIZON + 1) and not sample.dataset.rewards.any()
 
 
 @pytest.mark.slow
