@@ -3,8 +3,8 @@
 One row per evaluation of a member: task, method, preset, view of the skills, alpha, seed, environment steps, success,
 score (the share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole
 run, the command, with the name alone of a data file, for what learns offline alone the gradient steps so far, the
-view of all that learns (``observation.view``), and the steps of a skill. Rows of other runs that are in the file stay;
-rows of the same command and steps are replaced (a preset may have had others).
+view of all that learns (``observation.view``), the steps of a skill, and the run's name in a comparison. Rows of other
+runs that are in the file stay; rows of the same run (command, part of a comparison, steps of a skill) are replaced.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ import argparse
 import csv
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 from qdos_brax.files import write_text
 from qdos_brax.report.study import Study, read_study
+from qdos_brax.runs.comparison import is_comparison
 
 COLUMNS = (
     *("env", "method", "preset", "view", "alpha", "seed"),
     *("env_steps", "eval_success", "eval_score", "first_goal_step", "minutes_of_the_run", "command", "update"),
-    *("observation_view", "horizon"),
+    *("observation_view", "horizon", "part"),
 )
 
 
@@ -38,6 +40,7 @@ def rows_of(study: Study) -> list[dict[str, str]]:
             "view": run.config.skills.view,
             "observation_view": run.config.observation.view,
             "horizon": str(run.config.skills.horizon),
+            "part": run.path.name if is_comparison(run.path.parent) else "",
             "minutes_of_the_run": f"{run.summary['wall_seconds']['total'] / 60:.1f}",
             "command": " ".join(["python", "train.py", *kept[1:]]),
         }
@@ -55,6 +58,11 @@ def rows_of(study: Study) -> list[dict[str, str]]:
     return found
 
 
+def _of(row: Mapping[str, str | None]) -> tuple[str | None, ...]:
+    """Return what tells one run's rows from another's: the runs of a comparison have one command."""
+    return tuple(row.get(name) or "" for name in ("command", "part", "method", "horizon"))
+
+
 def main() -> None:
     """Run the script from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -63,10 +71,10 @@ def main() -> None:
     args = parser.parse_args()
     new = rows_of(read_study(args.runs))
     known: list[dict[str, str]] = []
-    replaced = {(row["command"], row["horizon"]) for row in new}
+    replaced = {_of(row) for row in new}
     if args.out.exists():
         with args.out.open(encoding="utf-8", newline="") as file:
-            known = [row for row in csv.DictReader(file) if (row["command"], row.get("horizon", "")) not in replaced]
+            known = [row for row in csv.DictReader(file) if _of(row) not in replaced]
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()

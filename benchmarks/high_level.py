@@ -19,10 +19,9 @@ import numpy as np
 
 from qdos_brax import config as configs
 from qdos_brax.analysis.conclusion import read_finished
-from qdos_brax.commands.arguments import guarded
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.schema import skill_keys
-from qdos_brax.errors import UserError
+from qdos_brax.errors import UserError, guarded
 from qdos_brax.methods.build import bind_phases, build_context, build_phases
 from qdos_brax.methods.given_skills import FREE
 from qdos_brax.population.members import Population
@@ -54,12 +53,23 @@ def check_settings(method: str, settings: list[str]) -> None:
             raise UserError(f"{key} would change nothing: data and skills stay those of the run; give it to train.py")
 
 
+def check_members(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> None:
+    """Refuse settings that make other members of a run, which would be trained on one another's skills.
+
+    Raises:
+        UserError: they differ in number or in their seeds.
+    """
+    if [member["seed"] for member in before] != [member["seed"] for member in after]:
+        raise UserError("members stay those of the run, each on its own skills: give one value per key, and no seed")
+
+
 def train(run: Path, members: list[int], settings: list[str]) -> list[dict[str, Any]]:
     """Return a row per member and evaluation."""
     trained, dataset = read_finished(RunFolder.open(str(run)))
     check_settings(trained.config.method, settings)
     config = configs.replace(trained.config, **dict(text.split("=", 1) for text in settings))
     everyone = configs.members(config)
+    check_members(configs.members(trained.config), everyone)
     members = members or list(range(len(everyone)))
     chosen = [everyone[member] for member in members]
     context = build_context(config, trained.env, dataset)

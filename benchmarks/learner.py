@@ -129,10 +129,12 @@ class Critic(nn.Module):
 
 def reference_sac(width: int) -> Calls:
     """See the module."""
-    ensemble = nn.vmap(
-        Critic, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=None, axis_size=CRITICS
-    )
-    critic, actor = ensemble((width,) * 3), DiagonalGaussian((width,) * 3, LATENT)
+
+    def ensemble(size: int) -> Any:
+        heads = nn.vmap(Critic, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=None, axis_size=size)
+        return heads((width,) * 3)
+
+    critic, drawn, actor = ensemble(CRITICS), ensemble(1), DiagonalGaussian((width,) * 3, LATENT)
     optimiser = optax.adam(RATE)
     observation, action = jnp.zeros((1, OBSERVATION)), jnp.zeros((1, LATENT))
     parameters = {
@@ -152,7 +154,8 @@ def reference_sac(width: int) -> Calls:
         action_key, subset_key = jax.random.split(key)
         action, _ = tanh_gaussian_sample(action_key, *actor.apply(parameters["actor"], batch.next_observation))
         index = jax.random.choice(subset_key, CRITICS, (1,), replace=False)
-        value = critic.apply(parameters["target"], batch.next_observation, action)[index].min(axis=0)
+        chosen = jax.tree.map(lambda p: p[index], parameters["target"])  # RLPD's ``subsample_ensemble``
+        value = drawn.apply(chosen, batch.next_observation, action).min(axis=0)
         target = batch.reward + DISCOUNT * batch.mask * value
 
         def loss(critic_parameters: Any) -> jax.Array:

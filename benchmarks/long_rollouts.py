@@ -1,7 +1,7 @@
 """Make 100,000 steps of every task: ``python benchmarks/long_rollouts.py [--out results/long_rollouts.json]``.
 
 A hundred environments make a thousand control steps each, with resets in between. Half of the bodies walk straight on,
-into the walls (a humanoid starts standing and walks until it falls); the others act at random. Measured over all
+into the walls (a humanoid as far as it gets, for it begins with a fall); the others act at random. Measured over all
 states:
 
 - how many were not finite,

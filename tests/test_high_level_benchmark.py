@@ -38,3 +38,12 @@ def test_what_the_high_level_reads_may_change() -> None:
     high_level.check_settings("qdos", ["skills.latent_box=1", "labels.offline_reward=data", "flow.updates=9"])
     with pytest.raises(UserError, match=r"flow\.updates"):
         high_level.check_settings("dsrl", ["flow.updates=9"])
+
+
+@pytest.mark.parametrize("after", [[0, 0, 1, 1], [2, 3], [0]])
+def test_members_stay_on_their_own_skills(after: list[int]) -> None:
+    """A list of values makes twice as many, a seed others, and either would be paired with another one's skills."""
+    before = [{"seed": 0}, {"seed": 1}]
+    high_level.check_members(before, before)
+    with pytest.raises(UserError, match="one value per key, and no seed"):
+        high_level.check_members(before, [{"seed": seed} for seed in after])

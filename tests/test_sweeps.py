@@ -82,6 +82,20 @@ def test_a_sweep_of_other_settings_is_refused(tmp_path: Path) -> None:
         ray_tune.same_as_before(path, asked | {"samples": 2})
 
 
+def test_the_printed_report_is_of_the_trials_that_finished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Beside their folders lie logs, and stopped trials have no summary: the command would refuse both."""
+    ray_tune.print_report_command(tmp_path)
+    assert capsys.readouterr().out == ""
+    for name in ("a", "b", "stopped"):
+        (tmp_path / "trials" / name).mkdir(parents=True)
+        (tmp_path / "trials" / f"{name}.log").touch()
+    for name in ("a", "b"):
+        (tmp_path / "trials" / name / "summary.json").touch()
+    ray_tune.print_report_command(tmp_path)
+    trials, out = f"{tmp_path}/trials", f"{tmp_path}/report"
+    assert capsys.readouterr().out == f"report    python -m qdos_brax report {trials}/a {trials}/b --out {out}\n"
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_a_sweep_is_stopped_and_gone_on_with(tmp_path: Path) -> None:

@@ -10,16 +10,15 @@ as many steps; it then saves and ends. Settings are proposed by Optuna's default
 (SQLite; ``optuna-dashboard sqlite:///OUT/study.db`` shows it). One process runs the trials one after another: on Ctrl-C
 or SIGTERM the trial under way saves and ends, and the same command goes on with it where it was. When all are over:
 
-    python -m qdos_brax report runs/sweep/trials/* --out runs/sweep/report
+    python -m qdos_brax report $(dirname runs/sweep/trials/*/summary.json) --out runs/sweep/report
 
-leaves pruned trials out if only folders with a summary.json are given.
+(pruned trials have no summary.json, and no place in a report).
 """
 
 from __future__ import annotations
 
 import math
 import os
-import shlex
 import signal
 import sys
 from collections.abc import Mapping, Sequence
@@ -28,7 +27,15 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from benchmarks.sweeps.ray_tune import Run, check, same_as_before, searched, settings, sweep_parser
+from benchmarks.sweeps.ray_tune import (
+    Run,
+    check,
+    print_report_command,
+    same_as_before,
+    searched,
+    settings,
+    sweep_parser,
+)
 from qdos_brax.commands.arguments import positive
 from qdos_brax.errors import UserError
 
@@ -80,8 +87,7 @@ def sweep(out: Path, space: Space, flags: Sequence[str], trials: int, startup: i
         value = math.nan if trial.value is None else trial.value
         name, chosen = trial.user_attrs[_FOLDER], " ".join(settings(trial.params)[1::2])
         print(f"{name}: {chosen}, {trial.state.name.lower()}, success {value:.2f}")
-    folder = shlex.quote(str(out))
-    print(f"report    python -m qdos_brax report {folder}/trials/* --out {folder}/report", flush=True)
+    print_report_command(out)
     return 0
 
 

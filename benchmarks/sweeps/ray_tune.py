@@ -16,7 +16,9 @@ SIGTERM. The same command again continues unfinished trials exactly where they w
 set RAY_kill_child_processes_on_worker_exit=0 for ``ray start``: otherwise Ray kills a trial that takes more than 10
 seconds to save, which loses the work since the last checkpoint.) When all have finished:
 
-    python -m qdos_brax report runs/sweep/trials/* --out runs/sweep/report
+    python -m qdos_brax report $(dirname runs/sweep/trials/*/summary.json) --out runs/sweep/report
+
+(stopped trials have no summary.json, and no place in a report).
 """
 
 from __future__ import annotations
@@ -259,9 +261,16 @@ def sweep(
         else:
             ended += 1
         print(f"{metrics.get('trial_id')}: {' '.join(settings(result.config)[1::2])}, {how}")
-    folder = shlex.quote(str(out))
-    print(f"report    python -m qdos_brax report {folder}/trials/* --out {folder}/report", flush=True)
+    print_report_command(out)
     return 0 if ended == len(results) else 1
+
+
+def print_report_command(out: Path) -> None:
+    """Print the command that makes one report of the trials that have finished, if there are any."""
+    finished = [str(path.parent) for path in sorted(out.glob("trials/*/summary.json"))]
+    if finished:
+        line = shlex.join(["python", "-m", "qdos_brax", "report", *finished, "--out", str(out / "report")])
+        print(f"report    {line}", flush=True)
 
 
 def same_as_before(path: Path, asked: dict[str, Any]) -> None:

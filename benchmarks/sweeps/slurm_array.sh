@@ -6,7 +6,7 @@
 #SBATCH --array=0-7
 #SBATCH --gres=gpu:1
 #SBATCH --time=12:00:00
-#SBATCH --signal=TERM@120
+#SBATCH --signal=B:TERM@120
 set -eu
 out="runs/sweep/$SLURM_ARRAY_TASK_ID"
 if [ -e "$out/metrics.csv" ]; then # requeued: continue exactly where it was

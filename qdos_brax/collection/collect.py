@@ -114,8 +114,8 @@ def check_size(transitions: int, seed: int, num_envs: int) -> None:
     """Raise UserError if ``collect`` cannot take one of these numbers."""
     if transitions < SHORTEST_EPISODE:
         raise UserError(f"transitions must be at least {SHORTEST_EPISODE} (one episode), got {transitions}")
-    if num_envs < 1 or seed < 0:
-        raise UserError(f"seed must be 0 or more and num_envs 1 or more, got {seed} and {num_envs}")
+    if num_envs < 1 or not 0 <= seed < 2**32:
+        raise UserError(f"seed must be 0 to 2^32 - 1 and num_envs 1 or more, got {seed} and {num_envs}")
 
 
 def episode_length(transitions: int, num_envs: int, cap: int, chunk: int) -> int:

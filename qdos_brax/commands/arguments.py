@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
-import sys
-import traceback
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from qdos_brax.config import nearest
-from qdos_brax.errors import UserError
 
 
 class Parser(argparse.ArgumentParser):
@@ -56,29 +51,3 @@ def natural(text: str) -> int:
     if not text.isdigit():
         raise argparse.ArgumentTypeError(f"must be a whole number from 0, not {text!r}")
     return int(text)
-
-
-def guarded(work: Callable[[], int | None]) -> int:
-    """Return the exit code of ``work``; for a UserError print one line and return 2."""
-    try:
-        code = work() or 0
-        sys.stdout.flush()
-        return code
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 130
-    except Exception as error:
-        if not _is_from_opengl(error):
-            raise
-        asked = os.environ.get("MUJOCO_GL")
-        print(f"error: MUJOCO_GL is {asked!r}, which MuJoCo cannot load here ({error}); unset it", file=sys.stderr)
-        return 2
-
-
-def _is_from_opengl(error: Exception) -> bool:
-    """Return whether ``import mujoco`` failed at the OpenGL library that MUJOCO_GL names; only pictures need one."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return "MUJOCO_GL" in os.environ and any(Path(frame.filename).name == "gl_context.py" for frame in frames)

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qdos_brax import __version__
-from qdos_brax.commands.arguments import Parser, guarded, natural, parse, positive
+from qdos_brax.commands.arguments import Parser, natural, parse, positive
 from qdos_brax.commands.config import add_parser as add_config
 from qdos_brax.commands.streams import lasting_streams
 from qdos_brax.commands.train import add_options, train_main
-from qdos_brax.errors import UserError
+from qdos_brax.errors import UserError, guarded
 
 _PROGRAM = "python -m qdos_brax"
 

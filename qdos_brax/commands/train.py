@@ -10,12 +10,12 @@ from functools import partial
 from typing import Any
 
 from qdos_brax import __version__
-from qdos_brax.commands.arguments import Parser, guarded, natural, parse, positive
+from qdos_brax.commands.arguments import Parser, natural, parse, positive
 from qdos_brax.commands.streams import lasting_streams
 from qdos_brax.config import Config, load_programs, presets
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.schema import get_field, labelled, pretrain_keys
-from qdos_brax.errors import UserError
+from qdos_brax.errors import UserError, guarded
 
 
 def train_main(argv: Sequence[str] | None = None, prog: str = "python train.py") -> int:

@@ -61,6 +61,8 @@ def prepare(rows: Rows, env: Task) -> list[str]:
 
     Every training begins with it, and ``data check``.
     """
+    if not env.extra_size:
+        rows.extra = None  # whatever another maker's file means by it
     lines = errors(rows, env)
     if not lines:
         drop_unknown(rows, env)

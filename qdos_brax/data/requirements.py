@@ -66,7 +66,7 @@ def _segments(data: Rows | Dataset, config: Config) -> list[str]:
     if longest >= horizon:
         return []
     order = ""
-    if data.ends.mean() > 0.5 and data.observations.shape == data.next_observations.shape:
+    if len(data.ends) > 1 and data.ends.mean() > 0.5 and data.observations.shape == data.next_observations.shape:
         apart = (data.next_observations[:-1] != data.observations[1:]).reshape(len(data.ends) - 1, -1).any(axis=1)
         order = f"; next_observations are not the next row's observations in {apart.sum()} of {len(data.ends)} rows"
     return [

@@ -114,6 +114,7 @@ OTHERS = [
     "data make antmaze-medium --out {folder}",
     "data make antmaze-medium --out {file}/new.hdf5",
     "data make antmaze-medium --out {new}.hdf5 --transitions 3",
+    "data make antmaze-medium --out {new}.hdf5 --seed 4294967296",
     "data make antmaze-medium --out {new}.hdf5 --degraded-share 2",
     "data make antmaze-medium --out {new}.hdf5 --mix expert=0.5,nosuch=0.5",
 ]

@@ -146,6 +146,14 @@ def test_one_row_is_enough_for_single_transitions(env: envs.Task, count: int) ->
     assert len(findings(rows, env).errors) == 1
 
 
+def test_a_single_row_holds_no_segment(env: envs.Task) -> None:
+    rows = walk()
+    rows.drop(np.arange(120) >= 1)
+    rows.ends[:] = True
+    (line,) = findings(rows, env).errors
+    assert line.startswith("no episode has 20 steps, the length of a segment (longest 1)")
+
+
 def test_lengths_are_compared_with_horizon_and_cap(env: envs.Task) -> None:
     some = walk()
     some.ends[9] = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -62,6 +63,23 @@ def test_discrete_states_and_qualities_are_kept(tmp_path: Path) -> None:
         found, expected = getattr(after, name), getattr(before, name)
         np.testing.assert_array_equal(found, expected, err_msg=name)
         assert found.dtype == expected.dtype
+
+
+@pytest.mark.parametrize("kind", ["groups", "floats", "whole numbers"])
+def test_infos_of_other_makers_may_have_our_names(tmp_path: Path, kind: str) -> None:
+    pytest.importorskip("minari")
+    out = tmp_path / "antmaze-medium-v0"
+    assert main(["data", "export", str(SOURCE), "--env", "antmaze-medium", "--out", str(out)]) == 0
+    with h5py.File(out / "data" / "main_data.hdf5", "a") as file:
+        for episode in file.values():
+            steps = len(episode["actions"])
+            for name in ("infos/extra", "infos/quality"):
+                if kind == "groups":
+                    episode[f"{name}/step"] = np.arange(steps)
+                else:
+                    episode[name] = np.full((steps, 2), 0.5 if kind == "floats" else 1)
+    found = formats.read(out, envs.make("antmaze-medium", physics="mujoco"))
+    assert found.size == formats.load(SOURCE).size and found.extra is None and found.quality is None
 
 
 @pytest.mark.parametrize("name", ["antmaze", "taken-v0"])

@@ -289,6 +289,18 @@ def test_d4rl_arrays_in_an_npz_are_read_as_in_an_hdf5(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.flatnonzero(rows.rewards), [3, 4, 11])
 
 
+def test_an_npz_of_transitions_ends_episodes_where_they_do_not_follow(tmp_path: Path) -> None:
+    """D4RL's ``qlearning_dataset``: next observations and terminals, no timeouts."""
+    columns = d4rl_antmaze()
+    following = np.concatenate([columns["infos/qpos"], columns["infos/qvel"]], axis=1)
+    kept = {name: columns[name] for name in ("observations", "actions", "rewards", "terminals")}
+    np.savez(tmp_path / "q.npz", **kept, next_observations=following)
+    rows = formats.load(tmp_path / "q.npz")
+    np.testing.assert_array_equal(np.flatnonzero(rows.ends), [8, 15, 23])
+    np.testing.assert_array_equal(rows.next_observations, following)
+    assert any("2 episode ends are not marked, the first at row 8" in note for note in rows.notes)
+
+
 @pytest.mark.parametrize("missing", ["the positions", "the distance that is too far for a step"])
 def test_d4rl_episodes_end_at_terminals_where_nothing_shows_that_they_go_on(tmp_path: Path, missing: str) -> None:
     """The ordinary layout: an episode that terminates has no timeout, and no next observation."""

@@ -24,7 +24,7 @@ from qdos_brax.collection.experts.records import CurveRow, command_line, read_cu
 from qdos_brax.collection.experts.tasks import TASKS
 from qdos_brax.collection.experts.trainer import Sizes, Trainer
 from qdos_brax.collection.experts.weights import Actor, write_actor
-from qdos_brax.errors import UserError
+from qdos_brax.errors import UserError, guarded
 from qdos_brax.files import write_arrays, write_text
 from qdos_brax.high_level.sac import SACState
 from qdos_brax.runs.checkpoint import CheckpointStore, Position, choose
@@ -149,6 +149,11 @@ def main() -> None:
     option("--batch-size", metavar="N", type=int, default=256, help="rows per update (default 256)")
     option("--updates-per-step", metavar="N", type=int, default=16, help="critic updates per step (default 16)")
     args = parser.parse_args()
+    if args.updates_per_step < 1 or args.updates_per_step % Sizes.actor_every:
+        raise UserError(
+            f"--updates-per-step must be a multiple of {Sizes.actor_every}, the critic's updates per one of the actor, "
+            f"not {args.updates_per_step}"
+        )
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     sizes = Sizes(hidden=(args.width,) * 2, batch_size=args.batch_size, updates_per_step=args.updates_per_step)
     training = Training(Trainer(TASKS[args.expert](), sizes), args.out, args.seed, args.learner)
@@ -156,4 +161,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main))

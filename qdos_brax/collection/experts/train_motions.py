@@ -23,7 +23,7 @@ from qdos_brax.collection.experts.motion_goals import GOALS, MotionGoal
 from qdos_brax.collection.experts.records import CurveRow, command_line, read_curve
 from qdos_brax.collection.experts.rising import Motions
 from qdos_brax.collection.experts.weights import shipped
-from qdos_brax.errors import UserError
+from qdos_brax.errors import UserError, guarded
 from qdos_brax.files import write_arrays, write_text
 
 STARTS = 128  # bodies that fell, from which a search draws
@@ -147,4 +147,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main))

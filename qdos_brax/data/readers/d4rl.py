@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qdos_brax.data.readers.rows import Rows, after_action, discrete
+from qdos_brax.data.readers.rows import Rows, after_action, breaks_of, discrete, mismatch_of, note_breaks
 from qdos_brax.data.readers.table import DataTable
 
 _OPTIONAL = ("next_observations", "rewards", "timeouts", "infos/qpos", "infos/qvel", "infos/extra", "infos/quality")
@@ -63,8 +63,8 @@ def load(table: DataTable, jump: float | None) -> Rows:
     (observations,) = table.floats("observations", None)
     if "next_observations" in table:
         (following,) = table.floats("next_observations", None)
-        breaks = _breaks(observations, following)
-        mismatch = _mismatch(observations, following, breaks)
+        breaks = breaks_of(observations, following)
+        mismatch = mismatch_of(observations, following, breaks)
     elif jump is not None and "infos/qpos" in table:
         breaks = _jumps(observations, jump)
     else:
@@ -73,7 +73,7 @@ def load(table: DataTable, jump: float | None) -> Rows:
     if len(ends):
         ends[-1] = True
         if not mismatch:
-            _note_breaks(notes, marked, breaks)
+            note_breaks(notes, marked, breaks)
     if "next_observations" not in table:
         # A last row without a next state is of use where the task terminates in it: labelling decides.
         last_kept = ends & terminals
@@ -104,29 +104,6 @@ def load(table: DataTable, jump: float | None) -> Rows:
     return rows
 
 
-def _breaks(observations: np.ndarray, following: np.ndarray) -> np.ndarray:
-    """Return bool[N]: the next observation is not the next row's."""
-    breaks = np.zeros(len(observations), bool)
-    if len(breaks) > 1 and observations.shape == following.shape:  # else the sizes are reported by the checks
-        breaks[:-1] = np.abs(observations[1:] - following[:-1]).reshape(len(breaks) - 1, -1).max(axis=1) > 1e-6
-    return breaks
-
-
-def _mismatch(observations: np.ndarray, following: np.ndarray, breaks: np.ndarray) -> str:
-    """Return a line where most next observations are nearly, not exactly, the next row's: they were rounded."""
-    if len(breaks) < 2 or breaks.mean() <= 0.5:
-        return ""
-    apart = np.abs(observations[1:] - following[:-1])[breaks[:-1]]
-    limit = 2.0**-10 * np.abs(observations[1:])[breaks[:-1]] + 1e-6  # float16 rounds to within half of it
-    if (apart <= limit).reshape(len(apart), -1).all(axis=1).mean() <= 0.5:
-        return ""
-    return (
-        f"next_observations do not match the next row's observations in {breaks.sum()} of {len(breaks)} rows, by up "
-        f"to {np.median(apart.reshape(len(apart), -1).max(axis=1)):.2g} in a typical one, so that each of these rows "
-        "ends an episode: rounded to another precision? store both alike, or leave next_observations out"
-    )
-
-
 def _jumps(observations: np.ndarray, jump: float) -> np.ndarray:
     """Return bool[N]: the body is somewhere else in the next row.
 
@@ -136,13 +113,3 @@ def _jumps(observations: np.ndarray, jump: float) -> np.ndarray:
     if observations.ndim == 2:  # else the sizes are reported by the checks
         jumps[:-1] = np.linalg.norm(np.diff(observations[:, :2], axis=0), axis=1) > jump
     return jumps
-
-
-def _note_breaks(notes: list[str], marked: np.ndarray, breaks: np.ndarray) -> None:
-    unmarked = breaks & ~marked
-    unmarked[-1] = False
-    if unmarked.any():
-        notes.append(
-            f"{unmarked.sum()} episode ends are not marked, the first at row {unmarked.argmax()}: "
-            "timeouts out of step; ends are taken where the state jumps as well"
-        )

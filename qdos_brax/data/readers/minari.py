@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from qdos_brax.data.readers.rows import Rows, after_action, discrete, unreadable
+from qdos_brax.data.readers.rows import Rows, after_action, unreadable
 from qdos_brax.data.readers.table import NUMERIC
 from qdos_brax.errors import UserError
 
@@ -21,6 +21,7 @@ _STATES = {"infos/qpos", "infos/qvel"}
 # What is read of an episode's infos where all episodes have it, by the rows' field.
 _INFOS = {"qpos": "infos/qpos", "qvel": "infos/qvel", "extra": "infos/extra", "quality": "infos/quality"}
 _INTEGERS = {"extra": np.int32, "quality": np.int8}
+_OURS = {"infos/extra": 2, "infos/quality": 1}  # with their axes: infos of these names may be anything elsewhere
 _GOAL_KEYS = {"observation", "achieved_goal", "desired_goal"}
 
 
@@ -106,14 +107,22 @@ def _open(path: Path, file: h5py.File, name: str) -> dict[str, Any]:
     group, items = file[name], {}
     for key in (*_REQUIRED, *_INFOS.values()):
         try:
-            items[key] = _item(group, key)
+            item = _item(group, key)
         except KeyError:
             if key in _REQUIRED:
                 raise UserError(f"{path}: {name} has no {key!r}: damaged, or of another version") from None
+            continue
+        if key not in _OURS or _is_ours(item, _OURS[key]):
+            items[key] = item
     steps = group.attrs.get("total_steps")
     if steps is not None and steps != (length := _set(items["actions"]).shape[0]):
         raise UserError(f"{path}: {name} has {length} of its {steps} steps: the file is damaged")
     return items
+
+
+def _is_ours(item: Any, axes: int) -> bool:
+    """Return whether an info is what ``data export`` writes under its name: whole numbers, of so many axes."""
+    return isinstance(item, h5py.h5d.DatasetID) and item.dtype.kind in "biu" and len(item.shape or ()) == axes
 
 
 def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: slice) -> None:
@@ -142,8 +151,7 @@ def _fill(path: Path, name: str, items: Mapping[str, Any], rows: Rows, part: sli
         if len(values) not in (length, length + 1):
             raise UserError(f"{path}: {name} has {len(values)} rows of {_INFOS[field]}: the file is damaged")
         values = values[:length]  # one more in today's files, where reset's info comes first
-        whole = field in _INTEGERS
-        getattr(rows, field)[part] = discrete(path, f"{name}/{_INFOS[field]}", values) if whole else values
+        getattr(rows, field)[part] = values
 
 
 def _observations(item: Any) -> np.ndarray:

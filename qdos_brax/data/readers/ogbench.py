@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qdos_brax.data.readers.rows import Rows, discrete
+from qdos_brax.data.readers.rows import Rows, breaks_of, discrete, mismatch_of, note_breaks
 from qdos_brax.data.readers.table import DataTable
 from qdos_brax.errors import UserError
 
@@ -23,12 +23,18 @@ def load(table: DataTable) -> Rows:
     """
     num_rows = table.require(("observations", "actions", "terminals"), _OPTIONAL)
     marked = table.column("terminals") != 0
-    notes = []
+    notes: list[str] = []
+    mismatch = ""
     if num_rows and not marked[-1]:
         notes.append("the last trajectory is cut off before its end")
     if "next_observations" in table:
-        keep, ends = None, marked
+        keep = None
         (observations,), (following,) = table.floats("observations", None), table.floats("next_observations", None)
+        # Others than OGBench may mark terminals alone, as D4RL's ``qlearning_dataset`` does.
+        breaks = breaks_of(observations, following)
+        ends, mismatch = marked | breaks, mismatch_of(observations, following, breaks)
+        if num_rows and not mismatch:
+            note_breaks(notes, marked, breaks)
     else:
         keep = table.column("valids") != 0 if "valids" in table else ~marked
         if num_rows:
@@ -40,7 +46,7 @@ def load(table: DataTable) -> Rows:
         observations, following = table.floats("observations", keep, is_next)
     if len(ends):
         ends[-1] = True
-    rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes)
+    rows = Rows(observations, table.floats("actions", keep)[0], following, ends, notes=notes, mismatch=mismatch)
     for key in ("qpos", "qvel"):
         if key in table:
             setattr(rows, key, table.floats(key, keep)[0])

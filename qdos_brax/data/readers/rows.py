@@ -104,6 +104,40 @@ def discrete(path: Path, key: str, values: np.ndarray) -> np.ndarray:
     return whole.astype(np.int32)
 
 
+def breaks_of(observations: np.ndarray, following: np.ndarray) -> np.ndarray:
+    """Return bool[N]: the next observation is not the next row's."""
+    breaks = np.zeros(len(observations), bool)
+    if len(breaks) > 1 and observations.shape == following.shape:  # else the sizes are reported by the checks
+        breaks[:-1] = np.abs(observations[1:] - following[:-1]).reshape(len(breaks) - 1, -1).max(axis=1) > 1e-6
+    return breaks
+
+
+def mismatch_of(observations: np.ndarray, following: np.ndarray, breaks: np.ndarray) -> str:
+    """Return a line where most next observations are nearly, not exactly, the next row's: they were rounded."""
+    if len(breaks) < 2 or breaks.mean() <= 0.5:
+        return ""
+    apart = np.abs(observations[1:] - following[:-1])[breaks[:-1]]
+    limit = 2.0**-10 * np.abs(observations[1:])[breaks[:-1]] + 1e-6  # float16 rounds to within half of it
+    if (apart <= limit).reshape(len(apart), -1).all(axis=1).mean() <= 0.5:
+        return ""
+    return (
+        f"next_observations do not match the next row's observations in {breaks.sum()} of {len(breaks)} rows, by up "
+        f"to {np.median(apart.reshape(len(apart), -1).max(axis=1)):.2g} in a typical one, so that each of these rows "
+        "ends an episode: rounded to another precision? store both alike, or leave next_observations out"
+    )
+
+
+def note_breaks(notes: list[str], marked: np.ndarray, breaks: np.ndarray) -> None:
+    """Add a line to ``notes`` if episodes end in rows that the file does not mark."""
+    unmarked = breaks & ~marked
+    unmarked[-1] = False
+    if unmarked.any():
+        notes.append(
+            f"{unmarked.sum()} episode ends are not marked, the first at row {unmarked.argmax()}: "
+            "timeouts out of step; ends are taken where the state jumps as well"
+        )
+
+
 def after_action(path: Path, rows: Rows) -> None:
     """Replace simulator states that were stored after the action, as D4RL's ant mazes have them, in place.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import jax
@@ -13,11 +14,11 @@ from envs.physics.base import PipelineState
 from qdos_brax.collection.experts import symmetry, weights
 from qdos_brax.collection.experts.tasks import TASKS, HumanoidRising, HumanoidWalking
 from qdos_brax.collection.experts.tasks.base import EnvState, StepResult
-from qdos_brax.collection.experts.train import Training, read_learner
+from qdos_brax.collection.experts.train import Training, main, read_learner
 from qdos_brax.collection.experts.trainer import Sizes, Trainer
 from qdos_brax.collection.experts.views import forward_axis, random_direction, to_direction_frame, to_world_frame
 from qdos_brax.data.transitions import Transition
-from qdos_brax.errors import UserError
+from qdos_brax.errors import UserError, guarded
 
 SIZES = Sizes(
     num_envs=8,
@@ -203,3 +204,15 @@ def test_a_mirrored_humanoid_moves_as_its_image() -> None:
     expected = image(here.pipeline.qpos, here.pipeline.qvel)
     np.testing.assert_allclose(there.pipeline.qpos, expected[0], atol=1e-4)
     np.testing.assert_allclose(there.pipeline.qvel, expected[1], atol=1e-2)
+
+
+@pytest.mark.parametrize("flags", ["--updates-per-step 3", "--updates-per-step 0", "--learner {out}/none.npz"])
+def test_wrong_flags_are_one_line(
+    flags: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fewer updates than the actor's one in two would make none at all, and losses of nothing."""
+    command = f"train.py ant_walker --out {tmp_path} --steps 100 {flags.format(out=tmp_path)}"
+    monkeypatch.setattr(sys, "argv", command.split())
+    assert guarded(main) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
