@@ -25,6 +25,7 @@ from qdos_brax.data import formats, quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
+from qdos_brax.errors import guarded
 from qdos_brax.methods.learners_view import learners_dataset, learners_env
 from qdos_brax.methods.low_level_kinds import make_skill_model, value_phase
 from qdos_brax.population.members import Population
@@ -213,4 +214,4 @@ def share(dataset: Dataset) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main))

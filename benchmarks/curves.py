@@ -16,6 +16,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+from qdos_brax.errors import guarded
 from qdos_brax.files import write_text
 from qdos_brax.report.study import Study, read_study
 from qdos_brax.runs.comparison import is_comparison
@@ -84,4 +85,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main))

@@ -30,6 +30,7 @@ from qdos_brax.collection.default_set import default_dataset
 from qdos_brax.config import Config
 from qdos_brax.data import formats
 from qdos_brax.data.dataset import Dataset
+from qdos_brax.errors import guarded
 from qdos_brax.files import write_text
 from qdos_brax.methods.build import bind_phases, build_context, build_phases, plan_members
 from qdos_brax.population.members import Population
@@ -161,4 +162,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main))

@@ -24,6 +24,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import Normaliser, to_device
 from qdos_brax.data.quality import QUALITY
 from qdos_brax.data.segments import window
+from qdos_brax.errors import guarded
 from qdos_brax.methods.learners_view import learners_dataset
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
@@ -85,4 +86,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main))

@@ -42,6 +42,7 @@ from qdos_brax.analysis.conclusion import read_finished
 from qdos_brax.analysis.film import of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun
 from qdos_brax.data.dataset import Dataset
+from qdos_brax.errors import guarded
 from qdos_brax.methods.learners_view import run_dataset
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
@@ -238,4 +239,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main))

@@ -37,7 +37,7 @@ from benchmarks.sweeps.ray_tune import (
     sweep_parser,
 )
 from qdos_brax.commands.arguments import positive
-from qdos_brax.errors import UserError
+from qdos_brax.errors import UserError, guarded
 
 Space = Mapping[str, tuple[str, float, float] | list[str]]
 _FOLDER, _STOPPED = "folder", "stopped"  # Optuna's attributes of a trial: of its run, and whether it was interrupted
@@ -57,9 +57,6 @@ def main() -> int:
         check(flags, space)
         same_as_before(args.out.resolve() / "sweep.json", {"set": args.set, "flags": list(flags)})
         return sweep(args.out.resolve(), space, flags, args.trials, args.startup, args.sampler_seed)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print("stopped; the same command goes on", file=sys.stderr)
         return 130
@@ -152,4 +149,4 @@ def suggested(trial: Any, key: str, values: tuple[str, float, float] | list[str]
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded(main))

@@ -39,7 +39,7 @@ from typing import Any
 from qdos_brax.commands.arguments import Parser, positive
 from qdos_brax.commands.train import configs_from_args, train_parser
 from qdos_brax.config.scan import distribution
-from qdos_brax.errors import UserError
+from qdos_brax.errors import UserError, guarded
 from qdos_brax.files import user_errors, write_text
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import read_rows, step_of
@@ -184,13 +184,9 @@ def main() -> int:
         "--stop-early", metavar="STEPS", type=positive, help="stop trials that are behind, from STEPS on"
     )
     args, flags = parser.parse_known_args()
-    try:
-        space = searched(args.set)
-        check(flags, space)
-        return sweep(args, flags, space)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    space = searched(args.set)
+    check(flags, space)
+    return sweep(args, flags, space)
 
 
 def sweep(
@@ -287,4 +283,4 @@ def same_as_before(path: Path, asked: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded(main))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from envs.render import find_way
 from qdos_brax.analysis.finished import TrainedRun, load_run
 from qdos_brax.config.methods import METHODS
+from qdos_brax.config.schema import format_value
 from qdos_brax.data import formats
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.errors import UserError
@@ -119,4 +120,4 @@ def with_alpha(method: str, alpha: Any) -> str:
 def listed(values: Any) -> str:
     """Return one number or text, or several separated by commas."""
     each = values if isinstance(values, tuple) else (values,)
-    return ", ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in each)
+    return ", ".join(map(format_value, each))

@@ -65,13 +65,20 @@ def load_run(run: Path) -> TrainedRun:
     config = configs.from_yaml(folder.config)
     if folder.read_summary() is None:
         raise UserError(f"the run in {run} has not finished; continue it with: {resume_command(run)}")
-    env = make_task(config.env, config.physics)
+    env = _task_of(run, config)
     return trained_run(config, env, final_artifacts(folder.checkpoints, configs.config_hash(config)))
+
+
+def _task_of(run: Path, config: Config) -> Any:
+    try:
+        return make_task(config.env, config.physics)
+    except UserError as error:  # one of several runs, perhaps, that were made elsewhere
+        raise UserError(f"{run}: {error}") from error
 
 
 def _exported_run(path: Path) -> TrainedRun:
     config, found = read_export(path)
-    env = make_task(config.env, config.physics)
+    env = _task_of(path, config)
     trained = trained_run(config, env, found.arrays)
     try:
         jax.eval_shape(lambda: _decide(trained))

@@ -145,12 +145,12 @@ def check_method(config: Config) -> None:
         )
     if config.tuning.skills != "frozen" and method.low_level != "trajectory":
         raise UserError(f"{config.method} has no trajectory skills to fine-tune: tuning.skills must stay frozen")
-    least, tuning = 4.0, config.tuning  # episodes within the window; the guard counts three before it prefers any
-    if tuning.skills != "frozen" and tuning.window * tuning.trial_share < least:
+    tuning, trials = config.tuning, config.tuning.window * config.tuning.trial_share
+    if tuning.skills != "frozen" and trials < _LEAST_TRIALS:
         raise UserError(
-            f"tuning.window={tuning.window} and tuning.trial_share={tuning.trial_share:g} leave "
-            f"{tuning.window * tuning.trial_share:g} episodes to compare the tuned skills by, too few for them ever to "
-            f"be played; their product must be at least {least:g}"
+            f"tuning.window={tuning.window} and tuning.trial_share={tuning.trial_share:g} leave {trials:g} episodes to "
+            f"compare the tuned skills by, too few for them ever to be played; their product must be at least "
+            f"{_LEAST_TRIALS}"
         )
     if high.utd % high.actor_updates:
         raise UserError(
@@ -159,6 +159,7 @@ def check_method(config: Config) -> None:
         )
 
 
+_LEAST_TRIALS = 4  # within the window, about; the guard counts three before it prefers any
 _AS_BEFORE = {
     ("skills", "view"): "world",
     ("skills", "schedule"): "constant",

@@ -115,3 +115,8 @@ def plain(config: Config) -> dict[str, Any]:
         return [listed(item) for item in value] if isinstance(value, tuple) else value
 
     return {key: listed(value) for key, value in dataclasses.asdict(config).items()}
+
+
+def format_value(value: Any) -> str:
+    """Return a value of a configuration in few characters."""
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -13,10 +13,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from qdos_brax.config.schema import format_value
 from qdos_brax.files import replacing
 from qdos_brax.report.elements import PALETTE
 from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
-from qdos_brax.report.study import Study, format_value, short_key
+from qdos_brax.report.study import Study, short_key
 
 GREYS = ("#4d4d4d", "#7a7a7a", "#a5a5a5")  # of what others published
 TICKS = 8  # the most values of a scan that all get a label on its axis

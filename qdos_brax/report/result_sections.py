@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from qdos_brax.config.schema import format_value
 from qdos_brax.report.curves import MEASURES, TICKS, axis_positions, setting_colours
 from qdos_brax.report.elements import (
     PALETTE,
@@ -25,7 +26,7 @@ from qdos_brax.report.elements import (
 )
 from qdos_brax.report.series import Curve, Scan, Surface, curves, scans, surfaces
 from qdos_brax.report.statistics import mean_curve
-from qdos_brax.report.study import Member, Setting, Study, format_value, short_key
+from qdos_brax.report.study import Member, Setting, Study, short_key
 from qdos_brax.report.summary_cards import rank_settings, summary_cards
 
 # --- Summary ---------------------------------------------------------------------------------------------------

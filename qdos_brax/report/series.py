@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from qdos_brax.config.schema import format_value
 from qdos_brax.report.statistics import mean_curve
-from qdos_brax.report.study import Member, Setting, Study, format_value, short_key
+from qdos_brax.report.study import Member, Setting, Study, short_key
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from qdos_brax.config import Config, from_yaml, nearest, values_by_key
-from qdos_brax.config.schema import get, leaves
+from qdos_brax.config.schema import format_value, get, leaves
 from qdos_brax.errors import UserError
 from qdos_brax.report.published import Published
 from qdos_brax.runs import comparison
@@ -257,11 +257,6 @@ def _varied(members: Sequence[Member], method: str) -> list[str]:
 def short_key(key: str) -> str:
     """Return the last part of a dotted key in words, such as "advantage temperature"."""
     return key.rpartition(".")[2].replace("_", " ")
-
-
-def format_value(value: Any) -> str:
-    """Return a value of a configuration in few characters."""
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _reference(settings: Sequence[Setting], name: str | None) -> Setting:

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
+from qdos_brax.config.schema import format_value
 from qdos_brax.runs.metrics import Row, measured
 
 _SHOWN = {"success": "eval/success", "score": "eval/score", "return": "eval/return", "first goal": "first_goal_step"}
@@ -48,8 +49,7 @@ class MemberBoard:
         for name in (*self._names, *shown, "loss", ""):
             table.add_column(name.rpartition(".")[2].replace("_", " "), justify="right", no_wrap=True)
         for member, latest, loss in zip(self._members, self._latest, self._loss, strict=True):
-            values = [member[name] for name in self._names]
-            cells = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
+            cells = [format_value(member[name]) for name in self._names]
             cells += [f"{latest[column]:,.4g}" if column in latest else "" for column in shown.values()]
             frozen = latest.get("status_ok") == 0
             table.add_row(*cells, loss, "frozen" if frozen else "", style="red" if frozen else "")
