@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import faulthandler
 import json
+import os
+from collections.abc import Generator
 from pathlib import Path
 
 import jax
@@ -20,6 +23,29 @@ from qdos_brax.runs.folder import RunFolder
 # As every run has it (``qdos_brax.runs.jax_setup``): programs that call MuJoCo C can wait for ever on arrays that wait
 # for them if they are dispatched asynchronously.
 jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+_stderr = pytest.StashKey[int]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep the error output that pytest captures while tests run."""
+    config.stash[_stderr] = os.dup(2)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """End the process of a test that does not end, a tenth after its time, and say where its threads are.
+
+    ``timeout`` is a signal, which Python answers between two instructions: a test that waits within a C++ library never
+    comes to them, and a run of all tests would wait with it.
+    """
+    mark = item.get_closest_marker("timeout")
+    seconds = float(mark.args[0] if mark else item.config.getini("timeout"))
+    faulthandler.dump_traceback_later(1.1 * seconds, file=item.config.stash[_stderr], exit=True)
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
