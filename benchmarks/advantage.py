@@ -2,8 +2,8 @@
 
 Trains the values (and, for the latent advantage, the skills) as a run does, and ranks all segments of the data by each
 advantage. They are compared with the true progress, which training never sees: the decrease of the shortest path to the
-task's goal. Prints one row per value estimator, advantage and lambda, with uniform weights and with the true distance
-in place of V for comparison, and writes CSV.
+task's goal, or of the number of things that are not yet where they shall be. Prints one row per value estimator,
+advantage and lambda, with uniform weights and with the true distance in place of V for comparison, and writes CSV.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.segments import window
 from qdos_brax.errors import guarded
-from qdos_brax.methods.learners_view import learners_dataset, learners_env
+from qdos_brax.methods.learners_view import learners_env, run_dataset
 from qdos_brax.methods.low_level_kinds import make_skill_model, value_phase
 from qdos_brax.population.members import Population
 from qdos_brax.runs.jax_setup import prepare_jax
@@ -96,7 +96,7 @@ def state_values(
 
 def correlation(env: Any, dataset: Dataset, values: np.ndarray) -> float:
     """Return Pearson's correlation of V with minus the true distance, over the states whose distance is known."""
-    distance = np.asarray(env.distance_left(dataset.qpos), np.float64)
+    distance = np.asarray(env.distance_left(dataset.qpos, dataset.extra), np.float64)
     known = np.isfinite(distance)
     return float(np.corrcoef(values[known], -distance[known])[0, 1]) if values.std() > 0 else float("nan")
 
@@ -174,7 +174,7 @@ def main() -> None:
         env, transitions=d.transitions, degraded_share=d.degraded_share, noise=d.noise, seed=d.seed, num_envs=d.num_envs
     )
     logged, env = formats.read(path, env), learners_env(config, env)
-    dataset = learners_dataset(env, logged)
+    dataset = run_dataset(config, env, logged)
     data, _ = to_device(dataset, config.skills.horizon)
     found: dict[tuple[str, str], Scores] = {}
     for values in args.values.split(","):

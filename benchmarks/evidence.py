@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import skills
-from table import write_rows
+from table import aligned, write_rows
 
 import envs
 from qdos_brax import config as configs
@@ -30,7 +30,7 @@ from qdos_brax.collection.default_set import default_dataset
 from qdos_brax.config import Config
 from qdos_brax.data import formats
 from qdos_brax.data.dataset import Dataset
-from qdos_brax.errors import guarded
+from qdos_brax.errors import UserError, guarded
 from qdos_brax.files import write_text
 from qdos_brax.methods.build import bind_phases, build_context, build_phases, plan_members
 from qdos_brax.population.members import Population
@@ -84,8 +84,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     for arm, values in arms.items():
         cells = [f"{mean:.3f} [{low:.3f}, {high:.3f}]" for mean, low, high in zip(*mean_curve(np.array(values)))]  # noqa: B905
         lines.append([*map(str, arm), str(len(values)), *cells])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines) + "\n"
+    return aligned(lines)
 
 
 def train(config: Config, folder: RunFolder, env: Any, dataset: Dataset) -> Any:
@@ -113,19 +112,28 @@ def measure(config: Config, env: Any, dataset: Dataset, artifacts: Any, args: An
 
 
 def run_program(program: Program, asked: Config, env: Any, dataset: Dataset, args: Any) -> list[dict[str, Any]]:
-    """Return the rows of a program, from its folder if it has been measured."""
+    """Return the rows of a program, from its folder if it has been measured.
+
+    Raises:
+        UserError: its folder holds another configuration.
+    """
     folder = RunFolder(args.out / program.name)
-    done = folder.path / "evidence.csv"
+    done, of = folder.path / "evidence.csv", folder.path / "evidence.yaml"
     config = configs.replace(asked, **program.settings)
-    text = configs.to_yaml(config) + f"# {args.draws} draws, {args.states} states, {args.episodes} episodes\n"
-    if done.exists() and folder.config.read_text(encoding="utf-8") == text:
+    trained = configs.to_yaml(config)
+    text = f"{trained}# {args.draws} draws, {args.states} states, {args.episodes} episodes\n"
+    if done.exists() and of.exists() and of.read_text(encoding="utf-8") == text:
         return list(csv.DictReader(done.open(encoding="utf-8")))
+    if folder.config.exists() and folder.config.read_text(encoding="utf-8") != trained:
+        raise UserError(f"{folder.path} holds runs of another configuration; give another --out, or remove it")
     print(f"--- {program.name}", flush=True)
     folder.checkpoints.mkdir(parents=True, exist_ok=True)
     with folder.held():
-        write_text(folder.config, text)
+        write_text(folder.config, trained)
         rows = measure(config, env, dataset, train(config, folder, env, dataset), args)
+        of.unlink(missing_ok=True)  # rows without it are measured again
         write_rows(done, rows)
+        write_text(of, text)
     return rows
 
 

@@ -11,6 +11,7 @@ from envs.brax_base import State
 from envs.manipulation.kitchen_rig import JOINTS
 from envs.manipulation.manipspace_rig import ROBOT_JOINTS
 from envs.mazes.maze import UNIT
+from envs.render import steps_per_second
 from qdos_brax.analysis.finished import TrainedRun
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import to_device
@@ -19,7 +20,7 @@ from qdos_brax.skills.slow_features import fit_slow_features
 
 WALL = 1.3  # m between the body and the nearest wall's face, at most, of a state at a wall
 AWAY = 1.5  # m
-WAY_STEPS = 20  # control steps, two seconds of an ant: short skills have as long as a long one
+WAY_SECONDS = 2.0  # short skills have as long as a long one
 MOVED = 0.02  # m or rad
 NEAREST = 5  # logged states that tell the cost to go
 
@@ -55,10 +56,11 @@ class MazeTruth:
         env: a maze.
     """
 
-    reach_name, reach_steps = "freed_from_walls", WAY_STEPS
+    reach_name = "freed_from_walls"
 
     def __init__(self, env: Any) -> None:
         self._env = env
+        self.reach_steps = round(WAY_SECONDS * steps_per_second(env))
 
     def left(self, states: State) -> np.ndarray:
         """Return the shortest path to the goal."""

@@ -1,13 +1,13 @@
 """Measure the ceiling of a skill space, without RL: ``python benchmarks/skills.py RUN [RUN ..] --out FILE``.
 
-Plays draws from the skill prior in the simulator, of the first member of each setting of a finished run:
+Plays draws from the skill prior in the simulator, of every member of a finished run:
 
 - from logged states, some draws each: progress of a macro step in mean and of the best draw, and how far the outcomes
   lie from their mean;
-- R2 of the latent, as a linear map of the start's observation alone, and of that and the outcome: the second beyond the
-  first is what z says about what happens;
+- R2 of the latent, as a linear map of the start's observation alone, and of that and the outcome, and R2 of the outcome
+  from the observation alone, and from that and the latent: each second beyond its first is what z says of what happens;
 - the share of states in which skills have to get at something and do: in mazes states at a wall, less than WALL away,
-  from which WAY_STEPS of skills lead more than AWAY away, each the draw that leads furthest; for an arm all states,
+  from which WAY_SECONDS of skills lead more than AWAY away, each the draw that leads furthest; for an arm all states,
   where a draw moves a thing by MOVED;
 - random skills, one after the other: success and best score of whole episodes;
 - the oracle: success, score and steps of episodes in which the draw of most progress is played;
@@ -34,7 +34,7 @@ import numpy as np
 from regression import r2
 from skill_search import searches
 from skill_truths import Truth, truth_of
-from table import write_rows
+from table import aligned, write_rows
 
 from envs.brax_base import State
 from qdos_brax import config as configs
@@ -102,14 +102,17 @@ def from_logged_states(skills: Skills, truth: Truth, dataset: Dataset, states: i
     z = np.asarray(found["latent"]).reshape(-1, found["latent"].shape[-1])
     seen = np.tile(dataset.observations[rows], (len(outcome), 1))
     happened = outcome.reshape(len(z), -1)
-    # What an outcome says of z depends on the state.
+    # What an outcome says of z depends on the state, and what z says of it.
     turned = (happened[:, :, None] * seen[:, None, :]).reshape(len(z), -1)
+    played = (z[:, :, None] * seen[:, None, :]).reshape(len(z), -1)
     return {
         "progress_mean": float(gain.mean()),
         "progress_best": float(gain.max(axis=0).mean()),
         "spread": float(np.sqrt(outcome.var(axis=0).sum(axis=-1)).mean()),
         "r2_state": r2(z, seen),
         "r2_state_and_outcome": r2(z, seen, happened, turned),
+        "r2_outcome_of_state": r2(happened, seen),
+        "r2_outcome_of_state_and_latent": r2(happened, seen, z, played),
         truth.reach_name: share_reached(skills, truth, before, found),
     }
 
@@ -217,10 +220,18 @@ def measure_members(
         found |= whole_episodes(skills, truth, episodes) if episodes else {}
         found |= searches(Skills(trained, member, 1), truth.left, number) if number else {}
         rows.append(known | found | {"seconds": time.perf_counter() - started})
-        print(
-            "  ".join(f"{k} {v:.2f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()), flush=True
-        )
+        print(f"{member + 1} of {len(about)} members measured, {rows[-1]['seconds']:.0f} s", flush=True)
     return rows
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return a line per measure and a column per member: there are few members and many measures."""
+
+    def cell(value: Any) -> str:
+        return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+    names = dict.fromkeys(name for row in rows for name in row)
+    return aligned([[name, *(cell(row.get(name, "")) for row in rows)] for name in names])
 
 
 def main() -> None:
@@ -236,6 +247,7 @@ def main() -> None:
     prepare_jax()
     rows = [row for run in args.runs for row in measure(run, args.draws, args.states, args.episodes, args.searches)]
     write_rows(args.out, rows)
+    print(table(rows), end="")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The CSV that a benchmark leaves."""
+"""The table that a benchmark prints, and the CSV that it leaves."""
 
 from __future__ import annotations
 
@@ -6,6 +6,12 @@ import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> str:
+    """Return lines of cells as text, in columns."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines) + "\n"
 
 
 def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +38,18 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """
     with replacing(path) as partial:
         np.savez_compressed(partial, allow_pickle=False, **arrays)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return what JSON text holds.
+
+    Raises:
+        ValueError: it is no JSON, or nested deeper than Python follows, where ``json`` itself raises a RecursionError.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
 def try_to_write(path: Path) -> None:

@@ -9,6 +9,7 @@ import evidence
 import pytest
 
 from qdos_brax import config as configs
+from qdos_brax.errors import UserError
 
 
 def test_every_arm_is_there_once_for_every_seed() -> None:
@@ -52,5 +53,27 @@ def test_a_measured_program_is_read_and_not_trained_again(tmp_path: Path, monkey
     first = evidence.run_program(program, asked, None, None, args)
     again = evidence.run_program(program, asked, None, None, args)
     assert len(calls) == 1 and float(again[0]["spread"]) == first[0]["spread"] == 0.25
-    evidence.run_program(program, configs.replace(asked, seed=(20,)), None, None, args)
-    assert len(calls) == 2
+    args.draws = 4
+    evidence.run_program(program, asked, None, None, args)
+    assert len(calls) == 2  # trained before, which costs nothing; measured anew
+    for _ in range(2):
+        with pytest.raises(UserError, match="another configuration; give another --out"):
+            evidence.run_program(program, configs.replace(asked, seed=(20,)), None, None, args)
+    assert float(evidence.run_program(program, asked, None, None, args)[0]["spread"]) == 0.25 and len(calls) == 2
+
+
+def test_rows_that_were_cut_off_are_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    args = Namespace(out=tmp_path, draws=2, states=3, episodes=0)
+    asked = configs.load_config("antmaze-large", "cpu", {"seed": "20"})
+    program = evidence.programs(["start"], 1.0, 0.3, 3.0)[0]
+    calls: list[int] = []
+    monkeypatch.setattr(evidence, "train", lambda *_: calls.append(0))
+
+    def killed(*_: object) -> list[dict[str, float]]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evidence, "measure", killed)
+    with pytest.raises(KeyboardInterrupt):
+        evidence.run_program(program, asked, None, None, args)
+    monkeypatch.setattr(evidence, "measure", lambda *_: [{"view": "start", "seed": 20, "spread": 0.5}])
+    assert evidence.run_program(program, asked, None, None, args)[0]["spread"] == 0.5 and len(calls) == 2

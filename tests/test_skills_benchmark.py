@@ -12,6 +12,7 @@ import skill_search
 import skill_truths
 import skills
 
+import envs
 from envs.body_frame import BodyFrame
 from envs.brax_base import State
 
@@ -20,9 +21,70 @@ def state(qpos: Any, observation: Any = None) -> Any:
     return SimpleNamespace(obs=observation, pipeline_state=SimpleNamespace(qpos=np.asarray(qpos)))
 
 
+def engine(frame_skip: int) -> Any:
+    return SimpleNamespace(frame_skip=frame_skip, model=SimpleNamespace(opt=SimpleNamespace(timestep=0.02)))
+
+
+def test_every_body_has_two_seconds_to_get_away_from_a_wall() -> None:
+    """20 steps of an ant, at 10 a second, and 80 of a humanoid, at 40."""
+    for name, steps in (("antmaze-medium", 20), ("humanoidmaze-medium", 80)):
+        assert skill_truths.MazeTruth(envs.make(name, physics="mujoco")).reach_steps == steps
+
+
+def test_the_table_has_a_line_per_measure() -> None:
+    """A run of another task may have others; what is missing is left empty."""
+    rows = [{"task": "a", "spread": 0.25, "freed": 1.0}, {"task": "bc", "spread": 0.5}]
+    assert skills.table(rows).splitlines() == ["task    a      bc", "spread  0.250  0.500", "freed   1.000"]
+
+
+class Linear:
+    """Skills whose latent's first number says what happens, turned by the state, as loudly as ``heard``."""
+
+    horizon = 2
+
+    def __init__(self, heard: float) -> None:
+        self.heard, self.env = heard, SimpleNamespace(extra_size=0)
+
+    def reset_to(self, qpos: Any, qvel: Any, extra: Any) -> Any:
+        return state(qpos, jnp.asarray(qpos))
+
+    def play(self, before: Any, key: jax.Array) -> dict[str, Any]:
+        place = np.asarray(before.pipeline_state.qpos)
+        latent = np.asarray(jax.random.normal(key, (8, len(place), 3)))
+        moved = self.heard * latent[..., :1] * place[:, :1] + place[:, 1:]
+        return {"end": state(np.concatenate([place[:, :1] + 0 * moved, moved], axis=-1)), "latent": latent}
+
+
+class Moved:
+    """A truth about such a world: the second number is where the body is."""
+
+    reach_name, reach_steps = "moved", 0
+
+    def left(self, states: Any) -> np.ndarray:
+        return -states.pipeline_state.qpos[..., 1]
+
+    def outcome(self, before: Any, after: Any) -> np.ndarray:
+        return after.pipeline_state.qpos[..., 1:]
+
+    def reach(self, before: Any, after: Any) -> np.ndarray:
+        return np.abs(self.outcome(before, after)[..., 0]) > 0
+
+
+def test_what_happens_is_told_by_the_latent_only_where_it_is_heard() -> None:
+    """Var(z s) is 1 beside the state's own 1 (s of either sign, unit size): half of what happens is the state's."""
+    rng = np.random.default_rng(0)
+    place = np.stack([rng.choice([-1.0, 1.0], 400), rng.normal(size=400)], axis=-1)
+    dataset = SimpleNamespace(qpos=place, qvel=place, observations=place, extra=None)
+    heard, deaf = (skills.from_logged_states(Linear(size), Moved(), dataset, 400) for size in (1.0, 0.0))
+    np.testing.assert_allclose(heard["r2_outcome_of_state"], 0.5, atol=0.06)
+    np.testing.assert_allclose(heard["r2_outcome_of_state_and_latent"], 1.0, atol=1e-3)
+    np.testing.assert_allclose(deaf["r2_outcome_of_state"], 1.0, atol=1e-3)
+    assert abs(deaf["r2_state_and_outcome"]) < 0.05 < heard["r2_state_and_outcome"]
+
+
 def test_an_outcome_counts_from_where_the_body_faces() -> None:
     """A body that moves along y gets 2 m ahead and 1 m to its right, whatever qpos holds beside its place."""
-    truth = skill_truths.MazeTruth(SimpleNamespace(body_frame=BodyFrame(course=2)))
+    truth = skill_truths.MazeTruth(SimpleNamespace(body_frame=BodyFrame(course=2), engine=engine(5)))
     before = state([[1.0, 1.0, 0.0]], jnp.array([[1.0, 1.0, 0.0, 0.5]]))
     after = state([[[2.0, 3.0, 0.0]], [[1.0, 1.0, 0.0]]])
     np.testing.assert_allclose(truth.outcome(before, after), [[[2.0, -1.0]], [[0.0, 0.0]]], atol=1e-6)

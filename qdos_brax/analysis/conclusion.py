@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from qdos_brax.config.schema import format_value
 from qdos_brax.data import formats
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.errors import UserError
+from qdos_brax.files import parse_json
 from qdos_brax.runs.beside import start_beside
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import module_command, train_command
@@ -86,8 +86,8 @@ def read_finished(folder: RunFolder) -> tuple[TrainedRun, Dataset]:
     """
     trained = load_run(folder.path)
     try:
-        path = Path(json.loads(folder.provenance.read_text(encoding="utf-8"))["dataset"]["path"])
-    except (OSError, ValueError, KeyError) as error:
+        path = Path(parse_json(folder.provenance.read_text(encoding="utf-8"))["dataset"]["path"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"cannot read from {folder.provenance} which data the run had ({error})") from error
     return trained, formats.read(path, trained.env.unwrapped)
 

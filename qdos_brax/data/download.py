@@ -23,7 +23,7 @@ from qdos_brax import __version__
 from qdos_brax.data import cache, sources
 from qdos_brax.data.sources import PublicDataset
 from qdos_brax.errors import UserError
-from qdos_brax.files import write_text
+from qdos_brax.files import parse_json, write_text
 from qdos_brax.runs.fingerprints import sha256_once
 from qdos_brax.runs.progress import Progress
 
@@ -262,7 +262,7 @@ def _record(path: Path) -> Path:
 def _read_json(path: Path) -> dict[str, Any]:
     """Return a small JSON object; {} if the file is missing or damaged."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}

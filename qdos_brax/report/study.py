@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -13,6 +12,7 @@ from typing import Any
 from qdos_brax.config import Config, from_yaml, nearest, values_by_key
 from qdos_brax.config.schema import format_value, get, leaves
 from qdos_brax.errors import UserError
+from qdos_brax.files import parse_json
 from qdos_brax.report.published import Published
 from qdos_brax.runs import comparison
 from qdos_brax.runs.folder import RunFolder
@@ -205,8 +205,8 @@ def _provenance(folder: RunFolder) -> dict[str, Any]:
     if not folder.provenance.is_file():
         return {}
     try:
-        return dict(json.loads(folder.provenance.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
+        return dict(parse_json(folder.provenance.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
         raise UserError(f"cannot read {folder.provenance}: {error}") from error
 
 

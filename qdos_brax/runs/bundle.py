@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import replacing
+from qdos_brax.files import parse_json, replacing
 
 FORMAT = 1
 _KIND = "qdos-brax"
@@ -67,7 +67,7 @@ def read(path: Path) -> Bundle:
     if _digest(card, flat) != header.get("sha256"):
         raise UserError(f"{path} is damaged: its numbers do not have its checksum; export or fetch it again")
     try:
-        return Bundle(dict(json.loads(card)), _nested(flat))
+        return Bundle(dict(parse_json(card)), _nested(flat))
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is damaged: its card or its names cannot be read ({_line(error)})") from error
 

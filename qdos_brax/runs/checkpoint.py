@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import is_partial, replacing_folder, write_text
+from qdos_brax.files import is_partial, parse_json, replacing_folder, write_text
 from qdos_brax.runs import arrays, fingerprints
 
 _FORMAT = 1
@@ -173,7 +173,7 @@ class CheckpointStore:
 
     def _manifest(self, name: str) -> dict[str, Any]:
         try:
-            content = json.loads((self._folder / name / _MANIFEST).read_text(encoding="utf-8"))
+            content = parse_json((self._folder / name / _MANIFEST).read_text(encoding="utf-8"))
         except OSError as error:
             raise BrokenCheckpoint(f"its manifest cannot be read ({error.strerror})") from error
         except ValueError as error:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import replacing_folder, user_errors, write_text
+from qdos_brax.files import parse_json, replacing_folder, user_errors, write_text
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.hints import resume_flag
 
@@ -50,7 +50,7 @@ def runs(path: Path) -> dict[str, RunFolder]:
         UserError: there is no comparison at ``path``, or it is damaged.
     """
     try:
-        content = json.loads((path / _FILE).read_text(encoding="utf-8"))
+        content = parse_json((path / _FILE).read_text(encoding="utf-8"))
         names = content["methods" if "methods" in content else "runs"]  # "methods" until sizes were compared too
         return {str(name): RunFolder.open(path / name) for name in names}
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import os
 from collections.abc import Iterator
 from datetime import datetime
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import is_partial, user_errors
+from qdos_brax.files import is_partial, parse_json, user_errors
 from qdos_brax.runs.hints import resume_flag
 
 
@@ -106,7 +105,7 @@ class RunFolder:
             UserError: the file is damaged.
         """
         try:
-            content = dict(json.loads(self.provenance.read_text(encoding="utf-8")))
+            content = dict(parse_json(self.provenance.read_text(encoding="utf-8")))
             if not isinstance(content["dataset"]["sha256"], str):
                 raise ValueError("dataset.sha256 is no text")
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -122,10 +121,9 @@ class RunFolder:
         if not self.summary.is_file():
             return None
         try:
-            content = json.loads(self.summary.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            return dict(parse_json(self.summary.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError) as error:
             raise UserError(f"cannot read {self.summary}: {error}; remove it and --resume writes it again") from error
-        return dict(content)
 
 
 def new_path(root: str | Path, name: str) -> Path:

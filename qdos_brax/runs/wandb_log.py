@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from qdos_brax.errors import UserError
-from qdos_brax.files import write_text
+from qdos_brax.files import parse_json, write_text
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.metrics import Row, measured, step_of
 
@@ -95,7 +95,7 @@ class WandbLog:
         if not self._folder.wandb.exists():
             write_text(self._folder.wandb, json.dumps({"group": uuid.uuid4().hex[:8]}) + "\n")
         try:
-            return str(json.loads(self._folder.wandb.read_text(encoding="utf-8"))["group"])
+            return str(parse_json(self._folder.wandb.read_text(encoding="utf-8"))["group"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(
                 f"{self._folder.wandb} is damaged ({error!r}); remove it to start new runs there"

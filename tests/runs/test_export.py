@@ -129,6 +129,18 @@ def test_foreign_and_newer_files_are_refused(exported: Path, capsys: pytest.Capt
         assert len(lines) == 1 and message in lines[0], lines
 
 
+def test_a_card_without_bottom_is_refused(exported: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its checksum is right, and no JSON reader follows it."""
+    arrays, card = {"x": np.zeros(1, np.float32)}, "[" * 200_000
+    header = {"kind": "qdos-brax", "format": "1", "card": card, "sha256": bundle._digest(card, arrays)}
+    bad = exported.with_name("deep.safetensors")
+    save_file(arrays, bad, header)
+    capsys.readouterr()
+    assert main(["evaluate", str(bad), "--episodes", "1"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and "its card or its names cannot be read (nested too deeply)" in lines[0], lines
+
+
 @pytest.mark.slow
 def test_a_high_level_begins_on_the_skills_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("QDOS_DATA", str(tmp_path / "data"))

@@ -1,7 +1,7 @@
 """Getting up: a humanoid that fell lies straight until it is calm, turns onto its back, and rises by a fixed motion.
 
 A body held straight comes to rest in one of a few poses, whichever way it fell, and on its back always in the same one.
-From there one motion of few key poses gets it up, found by evolution (``train_riser``). What it is doing, and since
+From there one motion of few key poses gets it up, found by evolution (``train_motions``). What it is doing, and since
 when, is remembered from step to step, because a lying body does not show it. Functions take a single state, for use
 inside jit and under vmap.
 """

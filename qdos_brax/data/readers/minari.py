@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from qdos_brax.data.readers.rows import Rows, after_action, unreadable
 from qdos_brax.data.readers.table import NUMERIC
 from qdos_brax.errors import UserError
+from qdos_brax.files import parse_json
 
 _MAIN_FILE = "main_data.hdf5"
 _REQUIRED = ("observations", "actions", "rewards", "terminations", "truncations")
@@ -87,7 +87,7 @@ def _episode_names(path: Path, file: h5py.File) -> list[str]:
     metadata_path = path.with_name("metadata.json")
     attributes = dict(file.attrs)  # older versions keep the metadata here
     if metadata_path.is_file():
-        attributes |= json.loads(metadata_path.read_text(encoding="utf-8"))
+        attributes |= parse_json(metadata_path.read_text(encoding="utf-8"))
     if "total_episodes" in attributes:
         expected = int(attributes["total_episodes"])
     missing = sorted(set(range(max(expected, numbers[-1] + 1 if numbers else 0))) - set(numbers))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import zipfile
 import zlib
@@ -16,6 +15,7 @@ import h5py
 import numpy as np
 
 from qdos_brax.errors import UserError
+from qdos_brax.files import parse_json
 
 NUMERIC = "biuf"
 """Kinds of NumPy types that are read: booleans, integers, floating point."""
@@ -214,7 +214,7 @@ def stored_checksums(file: h5py.File) -> dict[str, int]:
     """
     if CHECKSUMS not in file.attrs:
         return {}
-    sums = json.loads(file.attrs[CHECKSUMS])
+    sums = parse_json(file.attrs[CHECKSUMS])
     if not isinstance(sums, dict):
         raise ValueError("the checksums are damaged")
     return sums
