@@ -20,8 +20,11 @@ from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
 from qdos_brax.report.study import Study, short_key
 
 GREYS = ("#4d4d4d", "#7a7a7a", "#a5a5a5")  # of what others published
+SHARES = ("success", "score")  # measures between 0 and 1
 TICKS = 8  # the most values of a scan that all get a label on its axis
 MEASURES = (("eval/success", "success"), ("eval/score", "score"), ("eval/return", "return"))
+WORDS = {"score": "score (share of the task's parts done)"}
+"""What an axis says of a measure, where its name alone does not say what it is."""
 
 
 def draw_curves(study: Study, out: Path) -> None:
@@ -49,17 +52,17 @@ def draw_curves(study: Study, out: Path) -> None:
         for axis, (column, name) in zip(row, measures, strict=True):
             for curve in curves(study, task, column):
                 _draw_curve(axis, curve, colours[curve.setting.label])
-            if name == "success":
-                _draw_published(axis, study, task)
+            _draw_published(axis, study, task, name)
             axis.set_xlabel("environment steps")
-            axis.set_ylabel(name)
+            axis.set_ylabel(WORDS.get(name, name))
             axis.set_title(task)
             axis.grid(alpha=0.3)
             if not axis.lines:
                 axis.text(0.5, 0.5, f"no {column} measured", ha="center", va="center", transform=axis.transAxes)
-        row[0].set_ylim(-0.02, 1.02)
-        if row[0].lines:
-            row[0].legend(fontsize="small")
+            if name in SHARES:
+                axis.set_ylim(-0.02, 1.02)
+                if axis.lines:
+                    axis.legend(fontsize="small")
     save_figure(figure, out)
 
 
@@ -105,9 +108,10 @@ def _draw_curve(axis: Axes, curve: Curve, colour: str) -> None:
             axis.plot(*xy[:, -1], "x", color=colour, markersize=9)
 
 
-def _draw_published(axis: Axes, study: Study, task: str) -> None:
-    for row, grey in zip((row for row in study.published if row.task == task), itertools.cycle(GREYS), strict=False):
-        axis.axhline(row.success, color=grey, linestyle=":", linewidth=1, label=row.label)
+def _draw_published(axis: Axes, study: Study, task: str, measure: str) -> None:
+    rows = [row for row in study.published if (row.task, row.measure) == (task, measure)]
+    for row, grey in zip(rows, itertools.cycle(GREYS), strict=False):
+        axis.axhline(row.result, color=grey, linestyle=":", linewidth=1, label=row.label)
 
 
 def _draw_scan(axis: Axes, scan: Scan) -> None:
@@ -120,14 +124,15 @@ def _draw_scan(axis: Axes, scan: Scan) -> None:
         else:
             axis.plot([], [], "o", color=colour, label=line.label)
         for at, members in zip(x, line.members, strict=True):
-            axis.plot([at] * len(members), [m.success for m in members], ".", color=colour, alpha=0.5)
+            axis.plot([at] * len(members), [getattr(m, scan.measure) for m in members], ".", color=colour, alpha=0.5)
     ticks = sorted({at for line in scan.lines for at in axis_positions(line, scan)[0]})
     if scan.log_scale:
         axis.set_xscale("log")
     if len(ticks) <= TICKS:
         axis.set_xticks(ticks, axis_positions(scan.lines[0], scan)[1] or [format_value(tick) for tick in ticks])
         axis.set_xticks([], minor=True)
-    axis.set(xlabel=short_key(scan.key), ylabel="success at the last evaluation", title=scan.task, ylim=(-0.02, 1.02))
+    label = f"{scan.measure} at the last evaluation"
+    axis.set(xlabel=short_key(scan.key), ylabel=label, title=scan.task, ylim=(-0.02, 1.02))
     axis.grid(alpha=0.3)
     axis.legend(fontsize="small")
 

@@ -24,7 +24,7 @@ def advise(steps: np.ndarray, success: np.ndarray, task: str) -> Advice:
 
     Args:
         steps: float[points], environment steps of the evaluations, increasing.
-        success: float[points], 0 to 1, the mean over the seeds.
+        success: float[points], 0 to 1, the mean over the seeds; the score where nobody succeeded.
         task: the task's full name.
     """
     last, best = float(success[-1]), float(success.max())
@@ -33,8 +33,8 @@ def advise(steps: np.ndarray, success: np.ndarray, task: str) -> Advice:
     if best == 0:
         return Advice(
             "never reached the goal",
-            f"See whether the data visits it (python -m qdos_brax data check FILE --env {task} --map map.png; FILE is "
-            f"named at the end of this page) and how far the skills below get; then try {longer}.",
+            f"See whether the data visits it (python -m qdos_brax data check FILE --env {task}; FILE is named at the "
+            f"end of this page) and how far the skills get (benchmarks/skills.py); then try {longer}.",
         )
     if last >= _LEARNED:
         return Advice("learned", "Compare it with other methods: --method qdos,supe --seed 0,1,2.")

@@ -15,9 +15,10 @@ class Published(NamedTuple):
     Attributes:
         task: as the report names it.
         method: its authors' name for it.
-        success: at the end, 0 to 1.
-        std: over seeds, of success.
-        before: success after the offline steps, 0 to 1.
+        measure: what they measured: success, or score (the share of the task's parts done).
+        result: of it at the end, 0 to 1.
+        std: over seeds, of the result.
+        before: of it after the offline steps, 0 to 1.
         offline_steps: gradient steps on the data.
         online_steps: environment steps.
         seeds: how many.
@@ -28,7 +29,8 @@ class Published(NamedTuple):
 
     task: str
     method: str
-    success: float
+    measure: str
+    result: float
     std: float
     before: float
     offline_steps: int | None
@@ -60,7 +62,8 @@ def _published(row: dict[str, str], task: str) -> Published:
     return Published(
         task,
         row["method"],
-        _number(row["success"]) / 100,
+        row["measure"],
+        _number(row["result"]) / 100,
         _number(row["std"]) / 100,
         _number(row["before"]) / 100,
         _count(row["offline_steps"]),

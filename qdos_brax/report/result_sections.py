@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from qdos_brax.config.schema import format_value
-from qdos_brax.report.curves import MEASURES, TICKS, axis_positions, setting_colours
+from qdos_brax.report.curves import MEASURES, SHARES, TICKS, WORDS, axis_positions, setting_colours
 from qdos_brax.report.elements import (
     PALETTE,
     Figure,
@@ -26,8 +26,8 @@ from qdos_brax.report.elements import (
 )
 from qdos_brax.report.series import Curve, Scan, Surface, curves, scans, surfaces
 from qdos_brax.report.statistics import mean_curve
-from qdos_brax.report.study import Member, Setting, Study, short_key
-from qdos_brax.report.summary_cards import rank_settings, summary_cards
+from qdos_brax.report.study import Member, Setting, Study, headline, short_key
+from qdos_brax.report.summary_cards import final_results, rank_settings, summary_cards
 
 # --- Summary ---------------------------------------------------------------------------------------------------
 
@@ -42,18 +42,20 @@ def summary_section(study: Study) -> Section:
 
 
 def _success_chart(study: Study, task: str, order: list[tuple[Setting, list[float]]]) -> Figure:
-    colours = setting_colours(study)
-    data = [trace for setting, _ in order for trace in _mean_and_members(setting, task, colours[setting.label])]
-    layout = axis_layout("success at the last evaluation", "")
+    colours, measure = setting_colours(study), headline(study, task)
+    shown = [_mean_and_members(setting, task, measure, colours[setting.label]) for setting, _ in order]
+    data = [trace for traces in shown for trace in traces]
+    layout = axis_layout(f"{measure} at the last evaluation", "")
     layout["xaxis"] |= {"range": [-0.03, 1.03], "tickformat": ".0%"}
     layout["yaxis"] |= name_axis(setting.label for setting, _ in order)
     return Figure(title_with_task(study, "every setting", task), data, layout, height=height_of_rows(len(order)))
 
 
-def _mean_and_members(setting: Setting, task: str, colour: str) -> Iterable[Trace]:
+def _mean_and_members(setting: Setting, task: str, measure: str, colour: str) -> Iterable[Trace]:
     """Yield a setting's mean with its interval, and its members."""
-    members = [member for member in setting.members[task] if not math.isnan(member.success)]
-    mean, low, high = (float(x[0]) for x in mean_curve(np.asarray([[member.success] for member in members])))
+    members = [member for member in setting.members[task] if not math.isnan(getattr(member, measure))]
+    results = np.asarray(final_results(members, measure))
+    mean, low, high = (float(x[0]) for x in mean_curve(results[:, None]))
     errors = {"type": "data", "symmetric": False, "thickness": 5, "width": 0}
     errors |= {"array": json_numbers([high - mean]), "arrayminus": json_numbers([mean - low])}
     yield {
@@ -66,8 +68,8 @@ def _mean_and_members(setting: Setting, task: str, colour: str) -> Iterable[Trac
         "showlegend": False,
         "meta": {"setting": setting.label},
     }
-    for member in members:
-        yield member_dot(member, member.success, setting.label, colour)
+    for member, result in zip(members, results, strict=True):
+        yield member_dot(member, float(result), setting.label, colour)
 
 
 # --- Learning curves -------------------------------------------------------------------------------------------
@@ -80,8 +82,8 @@ def learning_section(study: Study) -> Section:
         Figure(
             title_with_task(study, name, task),
             [trace for curve in drawn for trace in _curve(curve, colours[curve.setting.label])]
-            + (_published(study, task, drawn) if name == "success" else []),
-            axis_layout("environment steps", name, share=name in ("success", "score")),
+            + _published(study, task, name, drawn),
+            axis_layout("environment steps", WORDS.get(name, name), share=name in SHARES),
         )
         for task in study.tasks
         for column, name in MEASURES
@@ -114,14 +116,14 @@ def _curve(curve: Curve, colour: str) -> Iterable[Trace]:
             yield member_dot(member, float(x[-1]), float(y[-1]), colour, size=12) | name
 
 
-def _published(study: Study, task: str, drawn: Sequence[Curve]) -> list[Trace]:
+def _published(study: Study, task: str, measure: str, drawn: Sequence[Curve]) -> list[Trace]:
     """Return dotted grey lines at what others published, over the steps of the curves."""
     end = max((float(curve.steps[-1]) for curve in drawn if len(curve.steps)), default=1.0)
     line = {"mode": "lines", "line": {"color": "#7a7a7a", "dash": "dot", "width": 1}}
     return [
-        {"x": [0, end], "y": json_numbers([row.success] * 2), "name": f"{row.label} ({row.source})", **line}
+        {"x": [0, end], "y": json_numbers([row.result] * 2), "name": f"{row.label} ({row.source})", **line}
         for row in study.published
-        if row.task == task
+        if (row.task, row.measure) == (task, measure)
     ]
 
 
@@ -200,14 +202,14 @@ def scan_section(study: Study) -> Section:
     figures = [_scan_chart(study, scan) for scan in scans(study)]
     figures += [_surface_chart(study, surface) for surface in surfaces(study)]
     text = (
-        "Success at the last evaluation. Line: the mean over seeds, with its 95 % bootstrap interval; dots: the "
+        "At the last evaluation. Line: the mean over seeds, with its 95 % bootstrap interval; dots: the "
         "members. There is no line where other hyperparameters were varied together with this one."
     )
     return Section("Varied hyperparameters", text, figures=figures)
 
 
 def _scan_chart(study: Study, scan: Scan) -> Figure:
-    layout = axis_layout(short_key(scan.key), "success", share=True)
+    layout = axis_layout(short_key(scan.key), WORDS.get(scan.measure, scan.measure), share=True)
     names = axis_positions(scan.lines[0], scan)[1]
     every = sorted({value for line in scan.lines for value in line.values}) if names is None else []
     if scan.log_scale:
@@ -216,7 +218,7 @@ def _scan_chart(study: Study, scan: Scan) -> Figure:
         layout["xaxis"] |= {"tickvals": list(range(len(names))), "ticktext": names}
     elif len(every) <= TICKS:
         layout["xaxis"] |= {"tickvals": every, "ticktext": [format_value(value) for value in every]}
-    title = title_with_task(study, f"success over {short_key(scan.key)}", scan.task)
+    title = title_with_task(study, f"{scan.measure} over {short_key(scan.key)}", scan.task)
     return Figure(title, list(_scan_traces(scan)), layout)
 
 
@@ -236,7 +238,7 @@ def _scan_traces(scan: Scan) -> Iterable[Trace]:
             }
         for at, members in zip(x, line.members, strict=True):
             for member in members:
-                yield member_dot(member, at, member.success, colour)
+                yield member_dot(member, at, getattr(member, scan.measure), colour)
 
 
 def _surface_chart(study: Study, surface: Surface) -> Figure:
@@ -257,5 +259,5 @@ def _surface_chart(study: Study, surface: Surface) -> Figure:
     layout = axis_layout(first, second)
     for axis in ("xaxis", "yaxis"):
         layout[axis] |= {"type": "category"}
-    title = title_with_task(study, f"mean success over {first} and {second}, {surface.method}", surface.task)
+    title = title_with_task(study, f"mean {surface.measure} over {first} and {second}, {surface.method}", surface.task)
     return Figure(title, [heat], layout)

@@ -12,7 +12,7 @@ import numpy as np
 
 from qdos_brax.config.schema import format_value
 from qdos_brax.report.statistics import mean_curve
-from qdos_brax.report.study import Member, Setting, Study, short_key
+from qdos_brax.report.study import Member, Setting, Study, headline, short_key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,12 +44,14 @@ class Scan:
 
     Attributes:
         task: the task's full name.
+        measure: "success", or "score" where nobody succeeded.
         key: the dotted key of the hyperparameter.
         lines: one for each choice of method and of everything else that was varied. Where no two settings differ in
             this key alone (values drawn at random, or in pairs), one for each method, not joined.
     """
 
     task: str
+    measure: str
     key: str
     lines: list[ScanLine]
 
@@ -67,10 +69,10 @@ class ScanLine:
     Attributes:
         label: the method, and what else was varied.
         values: the values of the key, in rising order if they are numbers.
-        mean: float[values], success.
+        mean: float[values], of the scan's measure.
         low: the lower end of the mean's 95 % interval; nan for a single member.
         high: its upper end.
-        members: the members at each value.
+        members: the evaluated members at each value.
         joined: whether all else is equal along it, so that its points are joined.
     """
 
@@ -89,6 +91,7 @@ class Surface:
 
     Attributes:
         task: the task's full name.
+        measure: as of a scan.
         method: the method's name.
         keys: the dotted keys of the hyperparameters along x and along y.
         x: the values of the first, in rising order.
@@ -97,6 +100,7 @@ class Surface:
     """
 
     task: str
+    measure: str
     method: str
     keys: tuple[str, str]
     x: list[float]
@@ -128,10 +132,20 @@ def points(member: Member, column: str) -> np.ndarray:
     return np.asarray(sorted(kept)).T if kept else np.empty((2, 0))
 
 
+def mean_over_steps(member: Member) -> float:
+    """Return the area under a member's curve of success over the steps from its first evaluation to its last.
+
+    Divided by those steps, so that it is a share, 0 to 1; nan of a member that has no two evaluations online.
+    """
+    steps, success = points(member, "eval/success")
+    return float(np.trapezoid(success, steps) / (steps[-1] - steps[0])) if len(steps) > 1 else math.nan
+
+
 def scans(study: Study) -> list[Scan]:
     """Return each key of which a method has several values on a task, with the success under each value."""
     found = []
     for task in study.tasks:
+        measure = headline(study, task)
         present = [setting for setting in study.settings if task in setting.members]
         for key in dict.fromkeys(key for setting in present for key in setting.values):
             groups: dict[str, list[Setting]] = {}
@@ -139,15 +153,17 @@ def scans(study: Study) -> list[Scan]:
                 if key in setting.values:
                     rest = [f"{short_key(k)} {format_value(v)}" for k, v in setting.values.items() if k != key]
                     groups.setdefault(", ".join([setting.method, *rest]), []).append(setting)
-            lines = [_scan_line(label, group, task, key, True) for label, group in groups.items() if len(group) > 1]
+            lines = [
+                _scan_line(label, group, task, measure, key, True) for label, group in groups.items() if len(group) > 1
+            ]
             if not lines:
                 drawn: dict[str, list[Setting]] = {}
                 for setting in present:
                     if key in setting.values:
                         drawn.setdefault(setting.method, []).append(setting)
-                lines = [_scan_line(method, group, task, key, False) for method, group in drawn.items()]
+                lines = [_scan_line(method, group, task, measure, key, False) for method, group in drawn.items()]
             if any(len(line.values) > 1 for line in lines):
-                found.append(Scan(task, key, lines))
+                found.append(Scan(task, measure, key, lines))
     return found
 
 
@@ -155,6 +171,7 @@ def surfaces(study: Study) -> list[Surface]:
     """Return each pair of keys with numeric values of which a method has all combinations on a task."""
     found = []
     for task in study.tasks:
+        measure = headline(study, task)
         for method in dict.fromkeys(setting.method for setting in study.settings):
             settings = [s for s in study.settings if s.method == method and task in s.members]
             keys = [
@@ -165,10 +182,10 @@ def surfaces(study: Study) -> list[Surface]:
                 cells: dict[tuple[Any, Any], list[float]] = {}
                 for setting in settings:
                     own = cells.setdefault((setting.values[first], setting.values[second]), [])
-                    own += [m.success for m in setting.members[task] if not math.isnan(m.success)]
+                    own += [getattr(m, measure) for m in setting.members[task] if not math.isnan(getattr(m, measure))]
                 if min(len(x), len(y)) > 1 and len(cells) == len(x) * len(y):
                     mean = [[float(np.mean(cells[a, b])) if cells[a, b] else math.nan for a in x] for b in y]
-                    found.append(Surface(task, method, (first, second), x, y, np.asarray(mean)))
+                    found.append(Surface(task, measure, method, (first, second), x, y, np.asarray(mean)))
     return found
 
 
@@ -176,12 +193,12 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _scan_line(label: str, settings: Sequence[Setting], task: str, key: str, joined: bool) -> ScanLine:
+def _scan_line(label: str, settings: Sequence[Setting], task: str, measure: str, key: str, joined: bool) -> ScanLine:
     if all(_is_number(setting.values[key]) for setting in settings):
         settings = sorted(settings, key=lambda setting: setting.values[key])
-    members = [[m for m in setting.members[task] if not math.isnan(m.success)] for setting in settings]
+    members = [[m for m in setting.members[task] if not math.isnan(getattr(m, measure))] for setting in settings]
     settings = [setting for setting, group in zip(settings, members, strict=True) if group]
     members = [group for group in members if group]
-    ends = [[float(x[0]) for x in mean_curve(np.asarray([[m.success] for m in group]))] for group in members]
+    ends = [[float(x[0]) for x in mean_curve(np.asarray([[getattr(m, measure)] for m in group]))] for group in members]
     mean, low, high = np.asarray(ends).reshape(-1, 3).T
     return ScanLine(label, [setting.values[key] for setting in settings], mean, low, high, members, joined)

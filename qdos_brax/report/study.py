@@ -50,6 +50,7 @@ class Member:
         seed: its seed.
         values: by dotted key, everything in the configuration in which two settings may differ.
         success: at the last evaluation, 0 to 1; nan if it was never evaluated.
+        score: the share of the task that episodes of the last evaluation did, 0 to 1; nan for a task without parts.
         first_goal: environment steps when the goal was first reached; nan if never.
         frozen: whether it was frozen because its numbers were no longer finite.
         rows: its rows of metrics.csv.
@@ -61,6 +62,7 @@ class Member:
     seed: int
     values: dict[str, Any]
     success: float
+    score: float
     first_goal: float
     frozen: bool
     rows: list[Row]
@@ -150,6 +152,12 @@ def read_study(paths: Sequence[Path], reference: str | None = None) -> Study:
     )
 
 
+def headline(study: Study, task: str) -> str:
+    """Return the measure by which a task's settings are told apart: "success", or "score" where nobody succeeded."""
+    members = [member for setting in study.settings for member in setting.members.get(task, [])]
+    return "score" if any(m.score > 0 for m in members) and not any(m.success > 0 for m in members) else "success"
+
+
 def _folders(path: Path) -> list[RunFolder]:
     if comparison.is_comparison(path):
         return list(comparison.runs(path).values())
@@ -191,6 +199,7 @@ def _member(
         seed=int(entry["seed"]),
         values=values | values_by_key(entry),
         success=_number(entry["eval_success"]),
+        score=_number(entry.get("eval_score")),
         first_goal=_number(entry["first_goal_step"]),
         frozen=entry["status"] != "ok",
         rows=rows,

@@ -11,7 +11,7 @@ from qdos_brax.report.elements import Card
 from qdos_brax.report.next_step import advise
 from qdos_brax.report.series import curves
 from qdos_brax.report.statistics import mean_curve, probability_of_improvement
-from qdos_brax.report.study import Member, Setting, Study
+from qdos_brax.report.study import Member, Setting, Study, headline
 
 PHASES = ("data", "pretrain", "label", "online", "eval")
 _ENOUGH_SEEDS = 5  # with fewer, the bootstrap's interval is far too narrow
@@ -27,14 +27,18 @@ def summary_cards(study: Study) -> list[Card]:
 
 
 def rank_settings(study: Study, task: str) -> list[tuple[Setting, list[float]]]:
-    """Return (setting, final successes of its seeds) of all that were evaluated on a task, the best mean first."""
-    scores = [(setting, final_successes(setting.members.get(task, []))) for setting in study.settings]
+    """Return (setting, its seeds' final successes) of all that were evaluated on a task, the best mean first.
+
+    Where nobody succeeded and parts were done, scores take the place of successes (``headline``).
+    """
+    measure = headline(study, task)
+    scores = [(setting, final_results(setting.members.get(task, []), measure)) for setting in study.settings]
     return sorted(((s, own) for s, own in scores if own), key=lambda pair: -float(np.mean(pair[1])))
 
 
-def final_successes(members: Iterable[Member]) -> list[float]:
-    """Return the success at the last evaluation of the members that were evaluated, 0 to 1."""
-    return [member.success for member in members if not math.isnan(member.success)]
+def final_results(members: Iterable[Member], measure: str) -> list[float]:
+    """Return the success or score at the last evaluation of the members that were evaluated, 0 to 1."""
+    return [result for member in members if not math.isnan(result := getattr(member, measure))]
 
 
 def format_duration(seconds: float) -> str:
@@ -48,11 +52,12 @@ def _task_cards(study: Study, task: str) -> list[Card]:
     order = rank_settings(study, task)
     if not order:
         return [Card("Best success", "-", "No member was evaluated.")]
-    return [_best_card(order), _confidence_card(order), _first_goal_card(study, task), *_next_cards(study, task, order)]
+    best = _best_card(order, headline(study, task))
+    return [best, _confidence_card(order), _first_goal_card(study, task), *_next_cards(study, task, order)]
 
 
-def _best_card(order: list[tuple[Setting, list[float]]]) -> Card:
-    title, (best, scores) = "Best success", order[0]
+def _best_card(order: list[tuple[Setting, list[float]]], measure: str) -> Card:
+    title, (best, scores) = f"Best {measure}", order[0]
     mean, low, high = (float(x[0]) for x in mean_curve(np.asarray(scores)[:, None]))
     equal = [setting.label for setting, own in order if float(np.mean(own)) == mean]
     if mean == 0:
@@ -61,7 +66,9 @@ def _best_card(order: list[tuple[Setting, list[float]]]) -> Card:
         text = f"Equal at the last evaluation: {'; '.join(equal)}."
         return Card(title, f"{100 * mean:.0f} %, {len(equal)} settings", text)
     interval = "" if math.isnan(low) else f" (95 % interval of the mean: {100 * low:.0f} to {100 * high:.0f} %)"
-    return Card(title, best.label, f"{100 * mean:.0f} %{interval} at the last evaluation, {_seeds(len(scores))}.")
+    whole = "" if measure == "success" else " of the task's parts done, and the whole by nobody,"
+    result = f"{100 * mean:.0f} %{interval}{whole} at the last evaluation, {_seeds(len(scores))}."
+    return Card(title, best.label, result)
 
 
 def _confidence_card(order: list[tuple[Setting, list[float]]]) -> Card:
@@ -109,7 +116,7 @@ def _next_cards(study: Study, task: str, order: list[tuple[Setting, list[float]]
     if {run.summary["preset"] for run in study.runs} == {"smoke"}:
         text = "Its sizes only show that everything works; nothing is learned with them. Train without --preset smoke."
         return [Card(title, "a smoke run", text)]
-    for curve in curves(study, task, "eval/success"):
+    for curve in curves(study, task, f"eval/{headline(study, task)}"):
         if curve.setting is order[0][0] and not curve.offline:
             verdict, text = advise(curve.steps, curve.mean, task)
             return [Card(title, verdict, text)]

@@ -8,6 +8,7 @@ import io
 import math
 from collections.abc import Sequence
 
+from qdos_brax.report.series import mean_over_steps
 from qdos_brax.report.statistics import Estimate, interquartile_mean, mean_std, probability_of_improvement
 from qdos_brax.report.study import Member, Setting, Study
 from qdos_brax.runs.metrics import PART_DONE
@@ -55,21 +56,29 @@ class Table:
 
 
 def tables(study: Study) -> list[Table]:
-    """Return table 1, its statistics over seeds, table 2, the parts of tasks that have some, and what others published
-    if that is shown.
+    """Return table 1, of success and, where tasks have parts, of the score, its statistics over seeds, table 2, the
+    parts, and what others published if that is shown.
     """
+    title = "Table 1. Success at the last evaluation (%), mean ± std"
+    shown = [_result_table(study, "success", title)]
+    if any(_values(setting, task, "score") for setting in study.settings for task in study.tasks):
+        title = "Table 1, score: the share of the task's parts that episodes of the last evaluation did (%), mean ± std"
+        shown.append(_result_table(study, "score", title))
     others = [_published_table(study)] if study.published else []
-    return [_success_table(study), _statistics_table(study), _first_goal_table(study), *_parts_tables(study), *others]
+    return [*shown, _statistics_table(study), _first_goal_table(study), *_parts_tables(study), *others]
 
 
 def success_csv(study: Study) -> str:
     """Return table 1 as CSV: one row per setting and task, and one over all tasks if there are several.
 
-    Success and its statistics are shares, 0 to 1; a cell is empty where there are too few seeds.
+    Success and its statistics, the score and the area under the curve of success (``mean_over_steps``) are shares, 0 to
+    1; a cell is empty where there are too few seeds, and of tasks without parts and methods without curves.
     """
     rows: list[_CsvRow] = []
     for setting, task, scores, improvement in _statistics(study):
         mean, std = mean_std([score for group in scores for score in group])
+        names = study.tasks if task == _ALL else [task]
+        parts, areas = ([x for name in names for x in values(setting, name)] for values in (_parts_done, _areas))
         rows.append(
             {
                 "task": task,
@@ -77,6 +86,8 @@ def success_csv(study: Study) -> str:
                 "seeds": sum(map(len, scores)),
                 "mean": mean,
                 "std": std,
+                **dict(zip(("score", "score_std"), mean_std(parts), strict=True)),
+                **dict(zip(("area", "area_std"), mean_std(areas), strict=True)),
                 **_named("iqm", interquartile_mean(scores)),
                 "reference": study.reference.label,
                 **_named("improvement", improvement or Estimate(math.nan, math.nan, math.nan)),
@@ -99,25 +110,31 @@ def first_goal_csv(study: Study) -> str:
     return _csv(rows)
 
 
-def _success_table(study: Study) -> Table:
+def _result_table(study: Study, measure: str, title: str) -> Table:
     rows = [
-        [setting.label, *(_percent(*mean_std(_scores(setting, task))) for task in study.tasks)]
+        [setting.label, *(_percent(*mean_std(_values(setting, task, measure))) for task in study.tasks)]
         for setting in study.settings
     ]
     note = "standard deviation over seeds, with n - 1; not defined for one seed"
-    return Table("Table 1. Success at the last evaluation (%), mean ± std", ["method", *study.tasks], rows, note)
+    return Table(title, ["method", *study.tasks], rows, note)
 
 
 def _statistics_table(study: Study) -> Table:
     several = len(study.settings) > 1
     rows = []
     for setting, task, scores, improvement in _statistics(study):
-        row = [setting.label, task, str(sum(map(len, scores))), _interval(interquartile_mean(scores), 100, "{:.0f}")]
+        names = study.tasks if task == _ALL else [task]
+        area = _percent(*mean_std([x for name in names for x in _areas(setting, name)]))
+        iqm = _interval(interquartile_mean(scores), 100, "{:.0f}")
+        row = [setting.label, task, str(sum(map(len, scores))), iqm, area]
         rows.append([*row, _interval(improvement, 1, "{:.2f}")] if several else row)
-    header = ["method", "task", "seeds", "IQM (%) [95 %]"]
+    header = ["method", "task", "seeds", "IQM (%) [95 %]", "area (%)"]
     if several:
         header.append(f"P(better than {study.reference.label}) [95 %]")
-    note = "IQM: interquartile mean (of fewer than four scores: the mean); [95 %]: bootstrap over seeds within a task"
+    note = (
+        "IQM: interquartile mean (of fewer than four scores: the mean); [95 %]: bootstrap over seeds within a task; "
+        "area: under the curve of success, from the first evaluation to the last, mean ± std"
+    )
     return Table("Table 1, continued. Statistics over seeds", header, rows, note, words=2)
 
 
@@ -175,8 +192,9 @@ def _published_table(study: Study) -> Table:
             row.label,
             row.task,
             row.source,
+            row.measure,
             _percent(row.before, math.nan),
-            _percent(row.success, row.std),
+            _percent(row.result, row.std),
             count(row.offline_steps),
             count(row.online_steps),
             count(row.seeds),
@@ -185,9 +203,9 @@ def _published_table(study: Study) -> Table:
         for row in study.published
     ]
     counts = ["offline steps", "online steps", "seeds", "first goal"]
-    header = ["method", "task", "source", "offline (%)", "success (%)", *counts]
+    header = ["method", "task", "source", "measure", "offline (%)", "end (%)", *counts]
     note = "settings of others: their data, networks, steps and seeds; -: not said, or not measured"
-    return Table("Published by others, in settings of their own", header, rows, note, words=3)
+    return Table("Published by others, in settings of their own", header, rows, note, words=4)
 
 
 def _statistics(study: Study) -> list[tuple[Setting, str, list[list[float]], Estimate | None]]:
@@ -196,17 +214,28 @@ def _statistics(study: Study) -> list[tuple[Setting, str, list[list[float]], Est
     for setting in study.settings:
         for task in (*study.tasks, *([_ALL] if len(study.tasks) > 1 else [])):
             tasks = study.tasks if task == _ALL else [task]
-            scores = [_scores(setting, name) for name in tasks]
+            scores = [_values(setting, name, "success") for name in tasks]
             if not all(scores):
                 continue
-            reference = [_scores(study.reference, name) for name in tasks]
+            reference = [_values(study.reference, name, "success") for name in tasks]
             compared = setting is not study.reference and all(reference)
             found.append((setting, task, scores, probability_of_improvement(scores, reference) if compared else None))
     return found
 
 
-def _scores(setting: Setting, task: str) -> list[float]:
-    return [member.success for member in setting.members.get(task, []) if not math.isnan(member.success)]
+def _values(setting: Setting, task: str, measure: str) -> list[float]:
+    """Return "success" or "score" of the members that have it."""
+    found = [getattr(member, measure) for member in setting.members.get(task, [])]
+    return [value for value in found if not math.isnan(value)]
+
+
+def _parts_done(setting: Setting, task: str) -> list[float]:
+    return _values(setting, task, "score")
+
+
+def _areas(setting: Setting, task: str) -> list[float]:
+    found = map(mean_over_steps, setting.members.get(task, []))
+    return [value for value in found if not math.isnan(value)]
 
 
 def _first_goals(members: Sequence[Member]) -> tuple[list[float], int]:

@@ -20,6 +20,7 @@ def write_run(
     first_goals: Sequence[int | None] | None = None,
     data: str = "d" * 64,
     frozen: Sequence[int] = (),
+    scores: Sequence[float] = (),
     more: str = "",
 ) -> Path:
     """Write the folder of a finished run.
@@ -33,19 +34,23 @@ def write_run(
         first_goals: by member, seeds first as in a product of seeds and alphas.
         data: SHA-256 of the data file.
         frozen: members whose numbers were no longer finite.
+        scores: final scores by member, of a task with parts; the curve rises to them linearly, too.
         more: further lines of config.yaml.
     """
     by_alpha = success if isinstance(success, Mapping) else {0.2: success}
     seeds = range(len(next(iter(by_alpha.values())))) if seeds is None else seeds
     members: list[dict[str, Any]] = []
-    lines = ["member,seed,alpha,phase,env_steps,update,eval/success,eval/return,kl,sps"]
+    tail = ",eval/score" if scores else ""
+    lines = [f"member,seed,alpha,phase,env_steps,update,eval/success,eval/return,kl,sps{tail}"]
     for i, seed in enumerate(seeds):
         for alpha, finals in by_alpha.items():
             index, final = len(members), finals[i]
-            lines += [f"{index},{seed},{alpha},skills,,{update},,,{1 / update},9.0" for update in (10, 20)]
+            blank = "," if scores else ""
+            lines += [f"{index},{seed},{alpha},skills,,{update},,,{1 / update},9.0{blank}" for update in (10, 20)]
             for step in STEPS:
                 value = "" if final is None else final * step / STEPS[-1]
-                lines.append(f"{index},{seed},{alpha},online,{step},{step // 10},{value},{-step},,9.0")
+                score = f",{scores[index] * step / STEPS[-1]}" if scores else ""
+                lines.append(f"{index},{seed},{alpha},online,{step},{step // 10},{value},{-step},,9.0{score}")
             goal = first_goals[index] if first_goals else None
             members.append(
                 {
@@ -59,6 +64,7 @@ def write_run(
                     "first_goal_step": goal,
                     "status": "nan" if index in frozen else "ok",
                 }
+                | ({"eval_score": scores[index]} if scores else {})
             )
     alphas = list(by_alpha) if len(by_alpha) > 1 else next(iter(by_alpha))
     path.mkdir(parents=True)

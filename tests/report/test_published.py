@@ -21,11 +21,13 @@ def test_numbers_are_those_of_the_tables() -> None:
     found = {row.method: row for row in published_on(["antmaze-large-task1"])}
     assert set(found) == {"BC", "IQL", "SUPE", "QDOS 0.2", "QDOS 0.3"}
     best = found["QDOS 0.3"]
-    assert (best.success, best.std, best.seeds, best.first_goal, best.first_goal_std) == (0.96, 0.06, 3, 11_668, 9_465)
+    assert (best.measure, best.result, best.std, best.seeds) == ("success", 0.96, 0.06, 3)
+    assert (best.first_goal, best.first_goal_std) == (11_668, 9_465)
     assert math.isnan(best.before) and best.online_steps is None and "2608.19684" in best.source
     (fql,) = (row for row in published_on(["antsoccer-arena-task4"]) if row.method == "FQL")
-    assert (fql.before, fql.success, fql.offline_steps, fql.online_steps) == (0.28, 0.86, 1_000_000, 1_000_000)
+    assert (fql.before, fql.result, fql.offline_steps, fql.online_steps) == (0.28, 0.86, 1_000_000, 1_000_000)
     assert published_on(["antmaze-teleport-task1"]) == []
+    assert {row.measure for row in published_on(["kitchen-mixed", "kitchen-partial"])} == {"score"}
 
 
 def test_a_mean_over_tasks_is_shown_for_each_and_says_so() -> None:
@@ -38,7 +40,8 @@ def test_every_row_is_whole() -> None:
     rows = list(csv.DictReader(text.splitlines()))
     assert len({(row["task"], row["method"]) for row in rows}) == len(rows)
     for row in rows:
-        assert row["source"] and 0 <= float(row["success"]) <= 100, row
+        assert row["source"] and 0 <= float(row["result"]) <= 100, row
+        assert (row["measure"] == "score") == row["task"].startswith("kitchen"), row  # % of 4 subtasks
         assert row["task"].partition("-")[0] in {*envs.FAMILIES, "kitchen", "cube", "scene"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -12,11 +13,11 @@ import pytest
 
 from qdos_brax.commands import main as commands
 from qdos_brax.report.next_step import advise
-from qdos_brax.report.result_sections import learning_section
-from qdos_brax.report.series import curves, scans, surfaces
+from qdos_brax.report.result_sections import learning_section, summary_section
+from qdos_brax.report.series import curves, mean_over_steps, scans, surfaces
 from qdos_brax.report.study import read_study
 from qdos_brax.report.summary_cards import summary_cards
-from qdos_brax.report.tables import tables
+from qdos_brax.report.tables import success_csv, tables
 from qdos_brax.report.write import write_report
 from qdos_brax.runs import comparison
 from tests.report.folders import write_run
@@ -82,6 +83,8 @@ def test_tables_by_hand(tmp_path: Path) -> None:
     # 0.9 beats two of three, 0.95 beats two and ties with one, 1.0 beats all: (2 + 2.5 + 3) / 9.
     assert detail.rows[0][-1].startswith("0.83 [") and detail.rows[1][-1] == "-"
     assert detail.rows[0][3] == "95 [90, 100]"
+    # Linear from a quarter of the end at 1,000 steps to the end at 4,000: 0.625 of the ends, whose mean is 0.95.
+    assert detail.header[4] == "area (%)" and detail.rows[0][4] == "59 ± 3"
     assert goal.rows == [["qdos", "13,333 ± 5,774 (3/3)"], ["supe", "5,000 (1/3)"]]
     assert "| qdos | 95 ± 5 |" in success.markdown()
     assert success.text().splitlines()[2] == f"{'qdos':6}  {'95 ± 5':>20}"
@@ -90,6 +93,7 @@ def test_tables_by_hand(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["mean"] for row in rows] == ["0.95", "0.516667"] and rows[0]["improvement"] == f"{7.5 / 9:.6g}"
     assert rows[1]["improvement"] == "" and rows[0]["reference"] == "supe"
+    assert rows[0]["area"] == f"{0.625 * 0.95:.6g}" and rows[0]["score"] == ""
     table2 = (tmp_path / "out" / "table2.csv").read_text().splitlines()
     assert table2[1:] == ["antmaze-medium-task1,qdos,3,3,13333.3,5773.5", "antmaze-medium-task1,supe,3,1,5000,"]
     assert {file.name for file in report.files} == {file.name for file in (tmp_path / "out").iterdir()}
@@ -116,6 +120,35 @@ def test_a_score_has_panels_of_its_own_where_there_is_one(tmp_path: Path) -> Non
     assert names == {plain: ["success", "return"], scored: ["success", "score", "return"]}
     (curve,) = curves(read_study([scored]), "kitchen-mixed-task1", "eval/score")
     np.testing.assert_allclose(curve.mean, [0.5, 0.75, 1.0])
+
+
+def test_where_nobody_does_the_whole_task_its_parts_rank_the_settings(tmp_path: Path) -> None:
+    """A score is the table's, the cards', the charts' and the scans' as long as every success is 0."""
+    kitchen = {"env": "kitchen-mixed-task1"}
+    scan = write_run(tmp_path / "a", success={0.1: [0, 0], 0.3: [0, 0]}, scores=[0.5, 0.75, 0.25, 0.5], **kitchen)
+    study = read_study([scan])
+    _, score, *_ = tables(study)
+    assert "score" in score.title and score.rows == [["qdos, alpha 0.1", "38 ± 18"], ["qdos, alpha 0.3", "62 ± 18"]]
+    best, _, _, went, _ = summary_cards(study)
+    assert (best.title, best.value) == ("Best score", "qdos, alpha 0.3") and "the whole by nobody" in best.text
+    assert went.value == "still rising"
+    (varied,) = scans(study)
+    assert varied.measure == "score" and varied.lines[0].mean.tolist() == [0.375, 0.625]
+    (chart,) = summary_section(study).figures
+    assert chart.layout["xaxis"]["title"]["text"] == "score at the last evaluation"
+    assert [trace["x"] for trace in chart.data][:3] == [[0.625], [0.75], [0.5]]
+    whole = write_run(tmp_path / "b", success=[0.05], scores=[0.2], **kitchen)
+    study = read_study([whole])
+    assert summary_cards(study)[0].title == "Best success" and tables(study)[1].rows == [["qdos", "20"]]
+    rows = list(csv.DictReader(success_csv(study).splitlines()))
+    assert rows[0]["score"] == "0.2" and rows[0]["score_std"] == ""
+
+
+def test_a_curve_of_one_evaluation_has_no_area(tmp_path: Path) -> None:
+    (member,) = read_study([write_run(tmp_path / "a")]).runs[0].members
+    assert mean_over_steps(member) == 0.625 * 0.5
+    alone = [row for row in member.rows if row["env_steps"] != "1000" and row["env_steps"] != "2000"]
+    assert np.isnan(mean_over_steps(dataclasses.replace(member, rows=alone)))
 
 
 def test_a_task_of_parts_has_a_table_of_them(tmp_path: Path) -> None:
