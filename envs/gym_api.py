@@ -51,8 +51,9 @@ class _Backed:
         if self._renderer is None:
             return None
         state = started(self._state)
-        states = zip(np.asarray(state.pipeline_state.qpos), np.asarray(state.info["goal"]), strict=True)
-        return tuple(self._renderer.frame(qpos, goal) for qpos, goal in states)
+        physics = state.pipeline_state
+        states = zip(*map(np.asarray, (physics.qpos, state.info["goal"], physics.extra)), strict=True)
+        return tuple(self._renderer.frame(*seen) for seen in states)
 
     def _release(self) -> None:
         """Give the OpenGL context back."""

@@ -66,7 +66,7 @@ class Renderer:
         if height < 1 or width < 1:
             raise ValueError(f"a frame of {height} x {width} has no pixels; height and width start at 1")
         self._model = scene.model
-        self._goal_marker = scene.goal_marker
+        self._goal_marker, self._paint = scene.goal_marker, scene.paint
         if scene.goal_marker is not None:  # MuJoCo ignores the place of a geom that was compiled at its body's
             self._model.geom_sameframe[self._model.geom(scene.goal_marker).id] = 0
         self._model.vis.global_.offheight = height
@@ -82,13 +82,21 @@ class Renderer:
         self._gl, self._context = _open_contexts(self._model, height, width)
         self._free = weakref.finalize(self, _free, self._gl, self._context)  # where close() was forgotten
 
-    def frame(self, qpos: Any, goal: Any) -> np.ndarray:
-        """Return uint8[height, width, 3], the state ``qpos[nq]`` with the mark of the goal, if any, at ``goal``."""
+    def frame(self, qpos: Any, goal: Any, extra: Any = None) -> np.ndarray:
+        """Return uint8[height, width, 3], the state ``qpos[nq]`` with the mark of the goal, if any, at ``goal``.
+
+        Args:
+            qpos: float[nq].
+            goal: of the task.
+            extra: int[e], the discrete state; None shows the model's own colours.
+        """
         if not self._free.alive:
             raise ValueError("this renderer is closed; make a new one")
         self._data.qpos[:] = np.asarray(qpos)
         if self._goal_marker is not None:
             self._model.geom(self._goal_marker).pos[: len(goal)] = np.asarray(goal)
+        if self._paint is not None and extra is not None:
+            self._paint(self._model, np.asarray(extra))
         mujoco.mj_forward(self._model, self._data)
         mujoco.mjv_updateScene(
             self._model, self._data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import mujoco
+import numpy as np
 
 View = Callable[[mujoco.MjModel, float], mujoco.MjvCamera]
 """From a model and the width of a frame divided by its height to a camera."""
@@ -22,12 +23,14 @@ class Scene:
         cameras: views by name, the default one first.
         aspect: width of a frame divided by its height, where the user asks for none.
         goal_marker: name of the geom that is moved to the goal (its x and y, or x, y and z); None draws no goal.
+        paint: colours the model as a discrete state ``extra[e]`` says; None for a task that does not show it.
     """
 
     model: mujoco.MjModel
     cameras: Mapping[str, View]
     aspect: float = 4 / 3
     goal_marker: str | None = None
+    paint: Callable[[mujoco.MjModel, np.ndarray], None] | None = None
 
 
 def free_view(model: mujoco.MjModel, aspect: float) -> mujoco.MjvCamera:

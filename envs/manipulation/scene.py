@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from envs.families import TaskSpec
 from envs.manipulation.manipspace import CUBE, NEAR, SHIFT, ManipSpaceTask, TableState, near
 from envs.manipulation.manipspace_rig import ROBOT_JOINTS
 from envs.manipulation.scene_rig import SceneRig
+from envs.scene import Scene
 
 _SLIDES = ROBOT_JOINTS + CUBE + 2  # place of the drawer in qpos; the window is next
+_HANDLES = ("drawer_handle", "window_handle")  # materials
+_LOCKED, _FREE = (0.9, 0.2, 0.2, 1.0), (0.95, 0.95, 0.95, 1.0)
 _RANGES = np.array([[-0.16, 0.0], [0.0, 0.2]])  # m, of drawer and window
 
 
@@ -50,6 +55,10 @@ class SceneTask(ManipSpaceTask):
         """Return the names of the cube, the buttons, the drawer and the window."""
         return ["cube", "button 0", "button 1", "drawer", "window"]
 
+    def scene(self) -> Scene:
+        """Return the table; what is locked, and its button, is red, as OGBench paints it."""
+        return replace(super().scene(), paint=_paint_locks)
+
     def start_of(self, description: dict[str, Any]) -> TableState:
         """Return about where everything starts."""
         return _table_state(description["init"])
@@ -61,6 +70,14 @@ class SceneTask(ManipSpaceTask):
     def _draw_fixtures(self, key: jax.Array, fixtures: jax.Array) -> jax.Array:
         shift = jax.random.uniform(key, (2,), minval=-SHIFT, maxval=SHIFT)
         return fixtures.at[2:].set(jnp.clip(fixtures[2:] + shift, *jnp.asarray(_RANGES.T, jnp.float32)))
+
+
+def _paint_locks(model: mujoco.MjModel, extra: np.ndarray) -> None:
+    """Paint each button and the handle of what it locks."""
+    for button, (free, handle) in enumerate(zip(extra, _HANDLES, strict=True)):
+        colour, body = _FREE if free else _LOCKED, model.body(f"button_{button}")
+        model.geom_rgba[body.geomadr[0] : body.geomadr[0] + body.geomnum[0]] = colour
+        model.mat(handle).rgba[:] = colour
 
 
 def _table_state(description: dict[str, Any]) -> TableState:

@@ -62,7 +62,7 @@ def measure_episode(env: Any, episode: Episode, horizon: int) -> dict[str, np.nd
     if parts is not None:
         found["parts"] = np.stack([np.asarray(done) for done in parts.values()], axis=-1)
     shown = picture_steps(len(episode.goals), None if parts is None else horizon)
-    return found | draw_episode(env, episode.states.qpos, episode.goals, shown)
+    return found | draw_episode(env, episode.states, episode.goals, shown)
 
 
 def place_of_body(env: Any, qpos: Any) -> Any:

@@ -32,7 +32,7 @@ def film_run(run: Path, out: Path, height: int = 480) -> dict[str, float]:
         height: height of its frames in pixels; the width follows from the maze.
 
     Returns:
-        The episode's success (0 or 1), return and length.
+        The episode's success (0 or 1), return and length, and of a task with parts the share that was done at its end.
 
     Raises:
         UserError: the run has not finished, this machine cannot draw or film, or the film cannot be written.
@@ -45,10 +45,11 @@ def film_run(run: Path, out: Path, height: int = 480) -> dict[str, float]:
         raise UserError(str(error)) from error
     with renderer, mp4(out, renderer.height, renderer.width, steps_per_second(env)) as write:
         for moment in EpisodeRunner(trained).episode(0):
-            write(renderer.frame(moment.qpos, moment.goal))
+            write(renderer.frame(moment.qpos, moment.goal, moment.extra))
             length += 1
             episode_return += float(moment.reward) if length else 0.0
-    return {"success": float(moment.success), "return": episode_return, "length": length}
+    score = {} if moment.score is None else {"score": float(moment.score)}
+    return {"success": float(moment.success), "return": episode_return, "length": length, **score}
 
 
 class Moment(NamedTuple):
@@ -58,6 +59,7 @@ class Moment(NamedTuple):
         qpos, qvel, extra: the simulator's state.
         goal: of the task.
         reward, success: of the step that led to it.
+        score: the share of the task that is done; None of a task without parts.
         decision: what was decided before that step; None for the start.
     """
 
@@ -67,6 +69,7 @@ class Moment(NamedTuple):
     goal: Any
     reward: Any
     success: Any
+    score: Any
     decision: Any
 
 
@@ -125,6 +128,7 @@ def _seen(state: Any, decision: jax.Array | None) -> Moment:
         goal=state.info["goal"],
         reward=state.reward,
         success=state.metrics["success"],
+        score=state.metrics.get("score"),
         decision=decision,
     )
 

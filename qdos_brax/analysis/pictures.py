@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from envs.render import NoOpenGL, Renderer, steps_per_second
-from envs.task import Task
+from envs.task import SimulatorStates, Task
 from qdos_brax.report.video import webp
 
 _FRAMES = 6
@@ -39,12 +39,12 @@ def picture_steps(states: int, horizon: int | None) -> np.ndarray:
     return np.append(chosen * horizon, states - 1)
 
 
-def draw_episode(env: Task, qpos: np.ndarray, goals: np.ndarray, shown: np.ndarray) -> dict[str, np.ndarray]:
+def draw_episode(env: Task, states: SimulatorStates, goals: np.ndarray, shown: np.ndarray) -> dict[str, np.ndarray]:
     """Draw an episode.
 
     Args:
         env: its task.
-        qpos: float[T, nq], its states.
+        states: its T states.
         goals: float[T, ..], the goal in each of them.
         shown: int[F], the steps of its pictures.
 
@@ -55,14 +55,18 @@ def draw_episode(env: Task, qpos: np.ndarray, goals: np.ndarray, shown: np.ndarr
         film_speed: float[], how many times as fast as the simulated time it plays.
         Nothing of these on a machine that cannot draw: a page without pictures is better than none.
     """
-    filmed = evenly_spaced(_FILM_FRAMES, len(qpos))
+    filmed = evenly_spaced(_FILM_FRAMES, len(goals))
+    extra = [None] * len(goals) if states.extra is None else states.extra
     try:
         with Renderer(env, _HEIGHT, _WIDTH, near_camera(env)) as renderer:
-            frames = {step: renderer.frame(qpos[step], goals[step]) for step in np.union1d(filmed, shown).tolist()}
+            frames = {
+                step: renderer.frame(states.qpos[step], goals[step], extra[step])
+                for step in np.union1d(filmed, shown).tolist()
+            }
     except NoOpenGL:
         return {}
     film = np.stack([frames[step] for step in filmed.tolist()])
-    seconds = (len(qpos) - 1) / steps_per_second(env)
+    seconds = (len(goals) - 1) / steps_per_second(env)
     return {
         "frames": np.stack([frames[step] for step in shown.tolist()]),
         "frame_steps": shown,

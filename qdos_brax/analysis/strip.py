@@ -55,7 +55,7 @@ def _frames(trained: TrainedRun) -> list[tuple[float, np.ndarray]]:
     """Return (seconds, image) of some of the episode's states, evenly spaced from its start to its end."""
     trained = on_mujoco_c(trained)
     env = trained.env
-    states = [(moment.qpos, moment.goal) for moment in EpisodeRunner(trained).episode(0)]
+    states = [(moment.qpos, moment.goal, moment.extra) for moment in EpisodeRunner(trained).episode(0)]
     rate = steps_per_second(env)
     try:
         with Renderer(env, _HEIGHT, _HEIGHT, near_camera(env)) as renderer:

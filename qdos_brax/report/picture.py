@@ -28,7 +28,7 @@ def draw_task(name: str, out: Path) -> None:
         env = make_task(name, "mujoco")
         state = env.reset(jax.random.key(0))
         with Renderer(env, height=720) as renderer:
-            image = renderer.frame(state.pipeline_state.qpos, state.info["goal"])
+            image = renderer.frame(state.pipeline_state.qpos, state.info["goal"], state.pipeline_state.extra)
     except NoOpenGL as error:
         raise UserError(str(error)) from error
     with user_errors(out):

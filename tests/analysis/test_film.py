@@ -172,7 +172,8 @@ def test_an_episode_in_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     qpos = np.tile(np.asarray(env.engine.model.qpos0), (201, 1))
     qpos[:, 0] = np.linspace(0, 4, 201)  # along the first corridor
     goals, shown = np.tile(np.asarray(env.goal_xy), (201, 1)), pictures.picture_steps(201, None)
-    found = pictures.draw_episode(env, qpos, goals, shown)
+    states = SimpleNamespace(qpos=qpos, qvel=None, extra=None)
+    found = pictures.draw_episode(env, states, goals, shown)
     assert found["film_speed"] == pytest.approx(20 / 6)
     assert found["frame_steps"].tolist() == [0, 40, 80, 120, 160, 200]
     with PIL.Image.open(io.BytesIO(found["film"].tobytes())) as film:
@@ -180,7 +181,7 @@ def test_an_episode_in_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     for frame in found["frames"].astype(int):  # the ant's brown in the middle
         assert frame[24, 32, 0] > 130 and frame[24, 32, 0] > frame[24, 32, 2] + 50
     monkeypatch.setenv("MUJOCO_GL", "off")
-    assert pictures.draw_episode(env, qpos, qpos, shown) == {}
+    assert pictures.draw_episode(env, states, goals, shown) == {}
 
 
 def test_which_states_become_pictures() -> None:

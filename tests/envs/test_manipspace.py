@@ -266,6 +266,19 @@ def test_a_picture_shows_the_arm_and_what_lies_on_the_table(name: str) -> None:
     assert (frames[0] != frames[1]).any() and (frames[1] != frames[2]).any()
 
 
+@pytest.mark.usefixtures("opengl")
+def test_a_picture_shows_what_is_locked() -> None:
+    """Buttons and handles are red where they lock: more red in the picture, and no memory of the one before."""
+    qpos = np.array(start_of(programs("scene-task2").reset(jax.random.key(0)))[0])
+    with render.Renderer(task("scene-task2"), 96, camera="near") as renderer:
+        locked, half, free, again = (
+            renderer.frame(qpos, (), extra).astype(int) for extra in ([0, 0], [1, 0], [1, 1], [0, 0])
+        )
+    red = [np.sum(image[..., 0] - image[..., 1] > 60) for image in (locked, half, free)]
+    assert red[0] > red[1] > red[2]
+    np.testing.assert_array_equal(locked, again)
+
+
 def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     ogbench_model.manip_space.cache_clear()
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
