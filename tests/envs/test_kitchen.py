@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +24,7 @@ from qdos_brax.high_level.evaluation import evaluate, summary
 from tests.collection.scripted.kitchen_player import play
 from tests.envs.broken_state import assert_reset_alone
 from tests.envs.kitchen_reference import kitchen, reference, rollout
+from tests.envs.saved_state import saved_and_restored
 
 
 @pytest.fixture(scope="module")
@@ -145,13 +147,16 @@ def test_two_thousand_random_steps_equal_the_reference(name: str, monkeypatch: p
         assert_the_same(env, random_actions(280, 100 + seed), monkeypatch, seed)
 
 
-def test_a_batch_equals_single_steps_and_a_state_goes_on_where_it_was(env: Any, three: Any) -> None:
+def test_a_batch_equals_single_steps_and_a_saved_state_goes_on_where_it_was(
+    env: Any, three: Any, tmp_path: Path
+) -> None:
     actions = random_actions(6, 2)
     batch = np.repeat(actions[:, None], 3, axis=1)
     keys = jax.random.split(jax.random.key(5), 3)
     states = [three.reset(keys)]
     for action in (*batch, *batch[3:]):
-        states.append(three.step(states[3] if len(states) == 7 else states[-1], action))
+        last = saved_and_restored(tmp_path, states[3]) if len(states) == 7 else states[-1]
+        states.append(three.step(last, action))
     np.testing.assert_array_equal(states[6].obs, states[9].obs)
     assert len(np.unique(states[6].obs[:, 0])) == 3  # the sensors err differently
     _, singles, _ = played(env, actions, keys[1], None)
