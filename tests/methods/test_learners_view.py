@@ -102,7 +102,9 @@ def test_skills_are_of_one_view() -> None:
     assert "observation.view" in skill_keys("trajectory")
 
 
-@pytest.mark.parametrize("name", ["antmaze-medium", "antsoccer-arena", "cube-double", "kitchen-mixed"])
+@pytest.mark.parametrize(
+    "name", ["antmaze-medium", "antsoccer-arena", "cube-double", "humanoidmaze-medium", "kitchen-mixed"]
+)
 def test_what_a_body_sees_beside_is_the_end_of_its_view(name: str) -> None:
     env = envs.make(name)
     observation = jax.jit(env.reset)(jax.random.key(0)).obs
