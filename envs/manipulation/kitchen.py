@@ -37,6 +37,9 @@ _THINGS = {
     "microwave": range(22, 23),
     "kettle": range(23, 30),
 }  # numbers of qpos
+_KETTLE_HEIGHT = 25  # number of qpos
+_STOVE = 1.6  # m
+_GIVE = 0.5  # rad or m, by which what is pushed hard passes its stop
 _LARGEST_ERROR = 2e-3  # of observed qpos; the arm's sensors err by up to 1e-3, and data is float32
 
 
@@ -129,11 +132,21 @@ class Kitchen(Task):
         return Scene(whole_model(), {"kitchen": kitchen, "near": fixed_view((-0.2, 0.5, 2.0), 70.0, -35.0, 2.2)})
 
     def check_steps(self, rows: StateRows) -> list[str]:
-        """Return a line where states and observations disagree by more than the sensors err."""
+        """Return a line where states and observations disagree by more than the sensors err, or no stop holds."""
         if rows.qpos is None:
             return []
+        found = []
         differ = np.abs(rows.observations[:, _OBSERVED_QPOS] - rows.qpos).max(axis=1) > _LARGEST_ERROR
-        return [f"qpos and observations disagree on the state in {count_rows(differ)}"] if differ.any() else []
+        if differ.any():
+            found.append(f"qpos and observations disagree on the state in {count_rows(differ)}")
+        model = self.engine.model
+        for joint in np.flatnonzero(model.jnt_limited):
+            (low, high), place = model.jnt_range[joint], model.jnt_qposadr[joint]
+            if (wrong := (rows.qpos[:, place] < low - _GIVE) | (rows.qpos[:, place] > high + _GIVE)).any():
+                found.append(f"{model.joint(joint).name} is beyond its range in {count_rows(wrong)}")
+        if (fallen := rows.qpos[:, _KETTLE_HEIGHT] < _STOVE - _GIVE).any():
+            found.append(f"the kettle has fallen off the stove in {count_rows(fallen)}")
+        return found
 
 
 def _thing(name: str, qpos: range) -> Thing:

@@ -14,10 +14,13 @@ from envs.brax_base import State
 from envs.families import TaskSpec
 from envs.manipulation.manipspace_rig import (
     CENTRE,
+    CUBE_COLUMNS,
     FRAME_SKIP,
+    HAND_COLUMN,
     PLACE_SCALE,
     ROBOT_COLUMNS,
     ROBOT_JOINTS,
+    WORKSPACE,
     ManipSpaceRig,
 )
 from envs.manipulation.ogbench_model import manip_space
@@ -34,6 +37,7 @@ NEAR = 0.04
 SHIFT = 0.01
 """By how much starts vary, in m."""
 _DIFFERENCE = 2e-3  # between an observation and qpos, in the observation's units; data is float32
+_OVERSHOOT = 0.1  # m, of the hand beyond the workspace that its targets are kept in
 _TABLE = np.array([[0.0, -0.6, -0.2], [0.9, 0.6, 0.6]])  # m, where cubes are while the physics is sound
 
 
@@ -167,16 +171,23 @@ class ManipSpaceTask(Task):
         """Return a line where cubes are at another place in the observations than in the states."""
         if rows.qpos is None:
             return []
-        cube = rows.observations[:, ROBOT_COLUMNS : ROBOT_COLUMNS + 3]
-        seen = cube - (rows.qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 3] - CENTRE) * PLACE_SCALE
-        differ = np.abs(seen).max(axis=1, initial=0.0) > _DIFFERENCE
-        return [f"qpos and observations disagree on the first cube in {count_rows(differ)}"] if differ.any() else []
+        found = []
+        for index, name in zip(range(self.cubes), ("first", "second"), strict=False):
+            column, place = ROBOT_COLUMNS + CUBE_COLUMNS * index, ROBOT_JOINTS + CUBE * index
+            seen = rows.observations[:, column : column + 3]
+            differ = np.abs(seen - (rows.qpos[:, place : place + 3] - CENTRE) * PLACE_SCALE).max(axis=1, initial=0.0)
+            if (wrong := differ > _DIFFERENCE).any():
+                found.append(f"qpos and observations disagree on the {name} cube in {count_rows(wrong)}")
+        return found
 
     def check_steps(self, rows: StateRows) -> list[str]:
         """Return a line per kind of state that no sound simulation reaches."""
         if rows.qpos is None:
             return []
         found = []
+        hand = rows.observations[:, HAND_COLUMN : HAND_COLUMN + 3] / PLACE_SCALE + CENTRE
+        if (away := ((hand < WORKSPACE[0] - _OVERSHOOT) | (hand > WORKSPACE[1] + _OVERSHOOT)).any(axis=1)).any():
+            found.append(f"the hand is out of its workspace in {count_rows(away)}")
         for index in range(self.cubes):
             first = ROBOT_JOINTS + CUBE * index
             place, turn = rows.qpos[:, first : first + 3], rows.qpos[:, first + 3 : first + CUBE]

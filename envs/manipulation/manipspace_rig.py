@@ -19,10 +19,11 @@ CENTRE = np.array([0.425, 0.0, 0.0])
 PLACE_SCALE, GRIPPER_SCALE = 10.0, 3.0
 HAND_COLUMN, ROBOT_COLUMNS, CUBE_COLUMNS = 12, 19, 9
 """In an observation: where the hand's place begins, how many numbers the robot has and, behind them, each cube."""
+WORKSPACE = np.array([[0.25, -0.35, 0.02], [0.6, 0.35, 0.35]])
+"""Between which places the hand is sent, in m."""
 
 # Numbers of the control law and of the observation are those of OGBench 1.2.2's ``ManipSpaceEnv``.
 _MOVE = np.array([0.05, 0.05, 0.05, 0.3, 1.0])  # m, m, m, rad and share of the gripper, of an action of 1
-_WORKSPACE = np.array([[0.25, -0.35, 0.02], [0.6, 0.35, 0.35]])  # m
 _CLOSED = 0.8  # rad, of the gripper's driver
 _FULL_GRIP = 255.0  # control of the gripper that shuts it
 _FIRM_CONTACT = 50.0  # N, of the force on the right pad that is sensed as 1
@@ -50,7 +51,7 @@ class ManipSpaceRig(Rig):
         self._arm_home = space.arm_home
         self._pinch = model.site(PINCH).id
         self._pad = model.body(_PAD).id
-        self._identity = np.concatenate([_MOVE, _WORKSPACE.ravel(), space.pinch_to_flange]).tobytes()
+        self._identity = np.concatenate([_MOVE, WORKSPACE.ravel(), space.pinch_to_flange]).tobytes()
         self._cubes = [
             int(model.jnt_qposadr[i]) for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE
         ]
@@ -77,7 +78,7 @@ class ManipSpaceRig(Rig):
         """Return the targets of the joints and the gripper's control, float64[n, 7], for the clipped action."""
         # In float32 up to the product, as the reference computes it for actions of that type.
         move = 0.5 * (np.clip(action, -1.0, 1.0) + 1) * (2.0 * _MOVE) - _MOVE
-        place = np.clip(memory[:, :3] + move[:, :3], *_WORKSPACE)
+        place = np.clip(memory[:, :3] + move[:, :3], *WORKSPACE)
         yaw = poses.yaw(poses.from_matrices(memory[:, 3:]))
         turn = poses.multiply(poses.from_yaw(move[:, 3]), poses.from_yaw(yaw))
         yaw = np.clip(poses.yaw(poses.multiply(turn, poses.inverse(poses.DOWN))), -np.pi, np.pi)

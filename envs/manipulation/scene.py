@@ -12,12 +12,15 @@ import numpy as np
 
 from envs.families import TaskSpec
 from envs.manipulation.manipspace import CUBE, NEAR, SHIFT, ManipSpaceTask, TableState, near
-from envs.manipulation.manipspace_rig import ROBOT_JOINTS
+from envs.manipulation.manipspace_rig import CUBE_COLUMNS, ROBOT_COLUMNS, ROBOT_JOINTS
 from envs.manipulation.scene_rig import SceneRig
 from envs.scene import Scene
+from envs.task import StateRows, count_rows
 
 _SLIDES = ROBOT_JOINTS + CUBE + 2  # place of the drawer in qpos; the window is next
 _HANDLES = ("drawer_handle", "window_handle")  # materials
+_GIVE = 0.05  # m, by which a drawer or a window that is pulled hard passes its stops
+_BUTTON_COLUMNS = (ROBOT_COLUMNS + CUBE_COLUMNS + 1, ROBOT_COLUMNS + CUBE_COLUMNS + 5)  # of an observation: 1 unlocks
 _LOCKED, _FREE = (0.9, 0.2, 0.2, 1.0), (0.95, 0.95, 0.95, 1.0)
 _RANGES = np.array([[-0.16, 0.0], [0.0, 0.2]])  # m, of drawer and window
 
@@ -66,6 +69,21 @@ class SceneTask(ManipSpaceTask):
     def goal_state(self, description: dict[str, Any]) -> TableState:
         """Return everything in its place."""
         return _table_state(description["goal"])
+
+    def check_steps(self, rows: StateRows) -> list[str]:
+        """Return a line per kind of state that no sound simulation reaches, and where buttons are told apart."""
+        found = super().check_steps(rows)
+        if rows.qpos is None:
+            return found
+        slides = rows.qpos[:, _SLIDES : _SLIDES + 2]
+        beyond = (slides < _RANGES[:, 0] - _GIVE) | (slides > _RANGES[:, 1] + _GIVE)
+        for name, wrong in zip(("drawer", "window"), beyond.T, strict=True):
+            if wrong.any():
+                found.append(f"the {name} is beyond its range in {count_rows(wrong)}")
+        for index, column in enumerate(_BUTTON_COLUMNS if rows.extra is not None else ()):
+            if (wrong := (rows.observations[:, column] > 0.5) != (rows.extra[:, index] == 1)).any():
+                found.append(f"extra and observations disagree on button {index} in {count_rows(wrong)}")
+        return found
 
     def _draw_fixtures(self, key: jax.Array, fixtures: jax.Array) -> jax.Array:
         shift = jax.random.uniform(key, (2,), minval=-SHIFT, maxval=SHIFT)

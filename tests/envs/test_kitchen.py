@@ -184,6 +184,20 @@ def test_completed_subtasks_are_state_that_can_be_given_and_decide_reward_and_su
     assert kitchen("kitchen-partial").score(extra).tolist() == [0, 0.25, 1]
 
 
+def test_what_no_stop_holds_is_noticed(env: Any) -> None:
+    qpos = np.tile(START_QPOS, (4, 1))
+    rows: Any = SimpleNamespace(qpos=qpos, observations=np.zeros((4, 59), np.float32))
+    seen = [*range(9), *range(18, 39)]
+    rows.observations[:, seen] = qpos
+    assert env.check_steps(rows) == []
+    qpos[1, 22], qpos[2, 25] = 0.6, 0.9  # the microwave's door pushed in, the kettle on the floor
+    rows.observations[:, seen] = qpos
+    assert env.check_steps(rows) == [
+        "microwave is beyond its range in 1 row (first 1)",
+        "the kettle has fallen off the stove in 1 row (first 2)",
+    ]
+
+
 def test_an_evaluation_tells_the_share_of_the_four(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(envs.Task, "episode_length", 4)  # three are completed in the first step, the kettle never
     qpos, qvel = almost_done()

@@ -247,8 +247,21 @@ def test_gymnasium_makes_one_and_a_batch() -> None:
 def test_data_of_another_task_is_noticed() -> None:
     env = task("scene-task2")
     states = programs("scene-task2").play(programs("scene-task2").reset(jax.random.key(2)), random_actions(30, 2))
-    rows: Any = SimpleNamespace(observations=np.asarray(states.obs), qpos=np.array(states.pipeline_state.qpos))
+    physics = states.pipeline_state
+    rows: Any = SimpleNamespace(
+        observations=np.array(states.obs), qpos=np.array(physics.qpos), extra=np.array(physics.extra)
+    )
     assert env.check_rows(rows) == [] and env.check_steps(rows) == []
+    moved: Any = SimpleNamespace(observations=rows.observations.copy(), qpos=rows.qpos.copy(), extra=1 - rows.extra)
+    moved.observations[3, 12] += 9
+    moved.qpos[5, DRAWER], moved.qpos[6:8, WINDOW] = 0.1, -0.1
+    assert env.check_steps(moved) == [
+        "the hand is out of its workspace in 1 row (first 3)",
+        "the drawer is beyond its range in 1 row (first 5)",
+        "the window is beyond its range in 2 rows (first 6)",
+        "extra and observations disagree on button 0 in 30 rows (first 0)",
+        "extra and observations disagree on button 1 in 30 rows (first 0)",
+    ]
     rows.qpos[4:6, 14] += 0.01
     rows.qpos[7, 17:21] = 0
     rows.qpos[8, 16] = 2
@@ -256,6 +269,18 @@ def test_data_of_another_task_is_noticed() -> None:
     assert env.check_steps(rows) == [
         "cube 0 is off the table in 1 row (first 8)",
         "the quaternion of cube 0 is not of length 1 in 1 row (first 7)",
+    ]
+
+
+def test_both_cubes_are_compared_with_the_observation() -> None:
+    state = programs("cube-double").reset(jax.random.key(0))
+    rows: Any = SimpleNamespace(
+        observations=np.asarray(state.obs)[None], qpos=np.array(state.pipeline_state.qpos)[None], extra=None
+    )
+    assert task("cube-double").check_rows(rows) == []
+    rows.qpos[0, 21] += 0.01
+    assert task("cube-double").check_rows(rows) == [
+        "qpos and observations disagree on the second cube in 1 row (first 0)"
     ]
 
 
