@@ -63,7 +63,7 @@ def counts(env: Any, rows: Dataset) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Print a line per goal, and append to a CSV if that is asked for."""
+    """Print a line per goal, and write a CSV if that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", help="cube-single, cube-double, scene, kitchen-mixed ..")
     parser.add_argument("file", type=Path, help="a data set with simulator states")
