@@ -9,6 +9,7 @@ import evidence
 import pytest
 
 from qdos_brax import config as configs
+from qdos_brax.config import Config
 from qdos_brax.errors import UserError
 
 
@@ -43,10 +44,15 @@ def test_an_arms_cell_is_the_mean_over_seeds_with_its_interval() -> None:
     assert off.split() == ["start", "off", "off", "2", "0.500", "[0.500,", "0.500]"]
 
 
+def program_of(seeds: str, out: Path) -> tuple[evidence.Program, Config, Namespace]:
+    """The first program of a table over ``seeds``, its configuration and the command's arguments."""
+    asked = configs.load_config("antmaze-large", "cpu", {"seed": seeds})
+    args = Namespace(out=out, draws=2, states=3, episodes=0)
+    return evidence.programs(["start"], 1.0, 0.3, 3.0)[0], asked, args
+
+
 def test_a_measured_program_is_read_and_not_trained_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    args = Namespace(out=tmp_path, draws=2, states=3, episodes=0)
-    asked = configs.load_config("antmaze-large", "cpu", {"seed": "20,21"})
-    program = evidence.programs(["start"], 1.0, 0.3, 3.0)[0]
+    program, asked, args = program_of("20,21", tmp_path)
     calls: list[int] = []
     monkeypatch.setattr(evidence, "train", lambda *_: calls.append(0))
     monkeypatch.setattr(evidence, "measure", lambda *_: [{"view": "start", "seed": 20, "spread": 0.25}])
@@ -63,9 +69,7 @@ def test_a_measured_program_is_read_and_not_trained_again(tmp_path: Path, monkey
 
 
 def test_rows_that_were_cut_off_are_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    args = Namespace(out=tmp_path, draws=2, states=3, episodes=0)
-    asked = configs.load_config("antmaze-large", "cpu", {"seed": "20"})
-    program = evidence.programs(["start"], 1.0, 0.3, 3.0)[0]
+    program, asked, args = program_of("20", tmp_path)
     calls: list[int] = []
     monkeypatch.setattr(evidence, "train", lambda *_: calls.append(0))
 

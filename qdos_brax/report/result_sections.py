@@ -26,8 +26,8 @@ from qdos_brax.report.elements import (
 )
 from qdos_brax.report.series import Curve, Scan, Surface, curves, scans, surfaces
 from qdos_brax.report.statistics import mean_curve
-from qdos_brax.report.study import Member, Setting, Study, headline, short_key
-from qdos_brax.report.summary_cards import final_results, rank_settings, summary_cards
+from qdos_brax.report.study import Member, Setting, Study, final_results, headline, short_key
+from qdos_brax.report.summary_cards import rank_settings, summary_cards
 
 # --- Summary ---------------------------------------------------------------------------------------------------
 

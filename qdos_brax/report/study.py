@@ -158,6 +158,11 @@ def headline(study: Study, task: str) -> str:
     return "score" if any(m.score > 0 for m in members) and not any(m.success > 0 for m in members) else "success"
 
 
+def final_results(members: Iterable[Member], measure: str) -> list[float]:
+    """Return the success or score at the last evaluation of the members that were evaluated, 0 to 1."""
+    return [result for member in members if not math.isnan(result := getattr(member, measure))]
+
+
 def _folders(path: Path) -> list[RunFolder]:
     if comparison.is_comparison(path):
         return list(comparison.runs(path).values())

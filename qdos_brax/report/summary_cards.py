@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from qdos_brax.report.elements import Card
 from qdos_brax.report.next_step import advise
 from qdos_brax.report.series import curves
 from qdos_brax.report.statistics import mean_curve, probability_of_improvement
-from qdos_brax.report.study import Member, Setting, Study, headline
+from qdos_brax.report.study import Setting, Study, final_results, headline
 
 PHASES = ("data", "pretrain", "label", "online", "eval")
 _ENOUGH_SEEDS = 5  # with fewer, the bootstrap's interval is far too narrow
@@ -34,11 +33,6 @@ def rank_settings(study: Study, task: str) -> list[tuple[Setting, list[float]]]:
     measure = headline(study, task)
     scores = [(setting, final_results(setting.members.get(task, []), measure)) for setting in study.settings]
     return sorted(((s, own) for s, own in scores if own), key=lambda pair: -float(np.mean(pair[1])))
-
-
-def final_results(members: Iterable[Member], measure: str) -> list[float]:
-    """Return the success or score at the last evaluation of the members that were evaluated, 0 to 1."""
-    return [result for member in members if not math.isnan(result := getattr(member, measure))]
 
 
 def format_duration(seconds: float) -> str:

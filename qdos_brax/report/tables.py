@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from qdos_brax.report.series import mean_over_steps
 from qdos_brax.report.statistics import Estimate, interquartile_mean, mean_std, probability_of_improvement
-from qdos_brax.report.study import Member, Setting, Study
+from qdos_brax.report.study import Member, Setting, Study, final_results
 from qdos_brax.runs.metrics import PART_DONE
 
 _ALL = "all tasks"
@@ -61,7 +61,7 @@ def tables(study: Study) -> list[Table]:
     """
     title = "Table 1. Success at the last evaluation (%), mean ± std"
     shown = [_result_table(study, "success", title)]
-    if any(_values(setting, task, "score") for setting in study.settings for task in study.tasks):
+    if any(final_results(_members(study, setting, _ALL), "score") for setting in study.settings):
         title = "Table 1, score: the share of the task's parts that episodes of the last evaluation did (%), mean ± std"
         shown.append(_result_table(study, "score", title))
     others = [_published_table(study)] if study.published else []
@@ -77,8 +77,7 @@ def success_csv(study: Study) -> str:
     rows: list[_CsvRow] = []
     for setting, task, scores, improvement in _statistics(study):
         mean, std = mean_std([score for group in scores for score in group])
-        names = study.tasks if task == _ALL else [task]
-        parts, areas = ([x for name in names for x in values(setting, name)] for values in (_parts_done, _areas))
+        members = _members(study, setting, task)
         rows.append(
             {
                 "task": task,
@@ -86,8 +85,8 @@ def success_csv(study: Study) -> str:
                 "seeds": sum(map(len, scores)),
                 "mean": mean,
                 "std": std,
-                **dict(zip(("score", "score_std"), mean_std(parts), strict=True)),
-                **dict(zip(("area", "area_std"), mean_std(areas), strict=True)),
+                **dict(zip(("score", "score_std"), mean_std(final_results(members, "score")), strict=True)),
+                **dict(zip(("area", "area_std"), mean_std(_areas(members)), strict=True)),
                 **_named("iqm", interquartile_mean(scores)),
                 "reference": study.reference.label,
                 **_named("improvement", improvement or Estimate(math.nan, math.nan, math.nan)),
@@ -112,7 +111,10 @@ def first_goal_csv(study: Study) -> str:
 
 def _result_table(study: Study, measure: str, title: str) -> Table:
     rows = [
-        [setting.label, *(_percent(*mean_std(_values(setting, task, measure))) for task in study.tasks)]
+        [
+            setting.label,
+            *(_percent(*mean_std(final_results(setting.members.get(task, []), measure))) for task in study.tasks),
+        ]
         for setting in study.settings
     ]
     note = "standard deviation over seeds, with n - 1; not defined for one seed"
@@ -123,8 +125,7 @@ def _statistics_table(study: Study) -> Table:
     several = len(study.settings) > 1
     rows = []
     for setting, task, scores, improvement in _statistics(study):
-        names = study.tasks if task == _ALL else [task]
-        area = _percent(*mean_std([x for name in names for x in _areas(setting, name)]))
+        area = _percent(*mean_std(_areas(_members(study, setting, task))))
         iqm = _interval(interquartile_mean(scores), 100, "{:.0f}")
         row = [setting.label, task, str(sum(map(len, scores))), iqm, area]
         rows.append([*row, _interval(improvement, 1, "{:.2f}")] if several else row)
@@ -213,29 +214,27 @@ def _statistics(study: Study) -> list[tuple[Setting, str, list[list[float]], Est
     found = []
     for setting in study.settings:
         for task in (*study.tasks, *([_ALL] if len(study.tasks) > 1 else [])):
-            tasks = study.tasks if task == _ALL else [task]
-            scores = [_values(setting, name, "success") for name in tasks]
+            tasks = _tasks(study, task)
+            scores = [final_results(setting.members.get(name, []), "success") for name in tasks]
             if not all(scores):
                 continue
-            reference = [_values(study.reference, name, "success") for name in tasks]
+            reference = [final_results(study.reference.members.get(name, []), "success") for name in tasks]
             compared = setting is not study.reference and all(reference)
             found.append((setting, task, scores, probability_of_improvement(scores, reference) if compared else None))
     return found
 
 
-def _values(setting: Setting, task: str, measure: str) -> list[float]:
-    """Return "success" or "score" of the members that have it."""
-    found = [getattr(member, measure) for member in setting.members.get(task, [])]
-    return [value for value in found if not math.isnan(value)]
+def _tasks(study: Study, name: str) -> list[str]:
+    """Return the tasks that a row of the statistics is about."""
+    return study.tasks if name == _ALL else [name]
 
 
-def _parts_done(setting: Setting, task: str) -> list[float]:
-    return _values(setting, task, "score")
+def _members(study: Study, setting: Setting, name: str) -> list[Member]:
+    return [member for task in _tasks(study, name) for member in setting.members.get(task, [])]
 
 
-def _areas(setting: Setting, task: str) -> list[float]:
-    found = map(mean_over_steps, setting.members.get(task, []))
-    return [value for value in found if not math.isnan(value)]
+def _areas(members: Sequence[Member]) -> list[float]:
+    return [area for member in members if not math.isnan(area := mean_over_steps(member))]
 
 
 def _first_goals(members: Sequence[Member]) -> tuple[list[float], int]:
