@@ -6,7 +6,9 @@ share the same data; only rewards and masks depend on the task.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -40,6 +42,10 @@ class EpisodeCollector(Protocol):
     @property
     def chunk_steps(self) -> int:
         """Return what the length of an episode has to be a multiple of, in control steps."""
+
+    @property
+    def at_once(self) -> int:
+        """Return how many threads may call ``episodes`` at once."""
 
     def episodes(
         self, kinds: np.ndarray, length: int, seed: int, turn: int, progress: Callable[[int], None] | None = None
@@ -98,10 +104,25 @@ def collect(
     rounds = -(-episodes // num_envs)
     width = -(-episodes // rounds)
     kinds = episode_kinds(recipe.mix, rounds * width, seed).reshape(rounds, width)
-    parts: list[dict[str, np.ndarray]] = []
-    for index in range(rounds):
-        report = None if progress is None else _offset(progress, index * width * length, transitions)
-        parts.append(collector.episodes(kinds[index], length, seed, index, report))
+
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(min(done, transitions), transitions)
+
+    count = _Count(rounds, report)
+    with ThreadPoolExecutor(collector.at_once) as pool:
+        waiting = [
+            pool.submit(collector.episodes, kinds[index], length, seed, index, count.of(index))
+            for index in range(rounds)
+        ]
+        try:
+            for played in as_completed(waiting):
+                played.result()
+        except BaseException:  # Ctrl-C too: nobody wants the other rounds any more
+            count.stop()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    parts = [played.result() for played in waiting]
     rows = {name: np.concatenate([part[name] for part in parts])[:transitions] for name in parts[0]}
     rows["timeouts"][-1] = True
     states = _Visited(rows["infos/qpos"], rows["infos/qvel"], rows.get("infos/extra"))
@@ -123,5 +144,31 @@ def episode_length(transitions: int, num_envs: int, cap: int, chunk: int) -> int
     return min(max(transitions // num_envs, SHORTEST_EPISODE), cap) // chunk * chunk
 
 
-def _offset(progress: Callable[[int, int], None], done: int, total: int) -> Callable[[int], None]:
-    return lambda rows: progress(min(done + rows, total), total)
+class _Count:
+    """Add up the rows of rounds that run at once, and stop them.
+
+    Args:
+        rounds: how many.
+        report: called with the sum whenever it grows, by one thread at a time.
+    """
+
+    def __init__(self, rounds: int, report: Callable[[int], None]) -> None:
+        self._rows, self._report = [0] * rounds, report
+        self._lock, self._stopped = threading.Lock(), False
+
+    def of(self, index: int) -> Callable[[int], None]:
+        """Return what a round calls with the number of its rows so far; it raises when the rounds were stopped."""
+
+        def report(rows: int) -> None:
+            with self._lock:
+                if self._stopped:
+                    raise InterruptedError("another round failed, or the program was interrupted")
+                self._rows[index] = rows
+                self._report(sum(self._rows))
+
+        return report
+
+    def stop(self) -> None:
+        """Let all rounds that run end at their next report."""
+        with self._lock:
+            self._stopped = True

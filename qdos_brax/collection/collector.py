@@ -40,12 +40,14 @@ class Collector:
     Attributes:
         version: of the rows, raised when the same arguments give others; part of the default sets' names.
         chunk_steps: what the length of an episode is a multiple of.
+        at_once: one call of ``episodes``; it is a program that uses all cores.
 
     Raises:
         UserError: no expert is shipped for the body.
     """
 
     chunk_steps = CHUNK_STEPS
+    at_once = 1
 
     def __init__(
         self,

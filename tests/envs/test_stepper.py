@@ -114,3 +114,30 @@ def test_calls_at_once_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
         _ = 1 // 0
     with steppers._calls.one_more() as calls:
         assert calls == 1
+
+
+def test_sensors_of_the_last_sub_step_alone_change_no_bit() -> None:
+    """An arm's force on its pad is seen after the last of 25; the reference computes all sensors in each of them."""
+    pytest.importorskip("ogbench")
+    stepper = stepper_of("cube-double")
+    model, engine = stepper._model, envs.make("cube-double", physics="mujoco").engine
+    assert model.nsensor == 1 and not model.opt.disableflags & steppers._NO_SENSORS
+    plain = BatchStepper(model, engine._rig, 25)
+    plain._sub_steps = lambda batch, ids: batch.step(ids=ids, nstep=25)  # type: ignore[method-assign]
+    qpos, qvel = np.tile(mujoco.MjData(model).qpos, (N, 1)).astype(np.float32), np.zeros((N, model.nv), np.float32)
+    qpos[:, :6] = engine._rig.arm_start(np.tile([0.42, 0.0, 0.045], (N, 1)), np.zeros(N))  # just above the table
+    qpos[:, 14:17], qpos[:, 21:24] = [0.42, 0.0, 0.02], [0.42, 0.2, 0.02]
+    extra, states = np.zeros((N, 0), np.int32), []
+    for one in (stepper, plain):
+        exact = np.zeros((N, one.nstate + engine._rig.memory_size))
+        exact[:, one.nstate :], _ = one.start(qpos, qvel, extra, NOTHING)
+        after = BatchStep(exact, extra, np.zeros(0))
+        for k in range(12):
+            action = np.random.default_rng(k).uniform(-0.3, 0.3, (N, 5)).astype(np.float32)
+            action[:, 4] = 1.0  # grip the cube
+            places = [values.astype(np.float32) for values in one.positions(after.exact)] if k else [qpos, qvel]
+            after = one.step(after.exact, np.full(N, k == 0), *places, extra, action, NOTHING)
+            states.append(np.concatenate([after.exact, after.sensed], axis=1))
+    np.testing.assert_array_equal(states[:12], states[12:])
+    contact = np.array(states)[:, :, stepper.nstate + engine._rig.memory_size + 18]
+    assert contact.max() > 0.1, "no pad was touched, so that the force was not put to the test"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
 from typing import NamedTuple
 
 import jax
@@ -48,6 +47,8 @@ class ScriptedCollector:
     Attributes:
         version: of the rows, given the demonstrator's actions.
         chunk_steps: an episode may have any length.
+        at_once: calls of ``episodes``, each with a demonstrator of its own: while one acts, in Python on one core,
+            another one's physics go on.
 
     Raises:
         UserError: the task runs on another engine.
@@ -55,6 +56,7 @@ class ScriptedCollector:
 
     version = 1
     chunk_steps = 1
+    at_once = 2
 
     def __init__(self, env: Task, recipe: CollectionRecipe) -> None:
         if not isinstance(env.engine, MujocoEngine):
@@ -62,7 +64,6 @@ class ScriptedCollector:
                 f"{env.spec.family} is demonstrated on MuJoCo C, not on {env.backend}; use --physics mujoco"
             )
         self.env, self.recipe, self._engine = env, recipe, env.engine
-        self._demonstrator = lru_cache(maxsize=1)(partial(scripted.make, env, noise=recipe.noise))
         self._observe = jax.jit(jax.vmap(jax.vmap(env.observe)))
 
     @property
@@ -82,7 +83,7 @@ class ScriptedCollector:
         """
         own, sensors = np.random.default_rng([seed, turn]).spawn(2)
         simulations = self._engine.simulations(sensors)
-        demonstrator = self._demonstrator(len(kinds))
+        demonstrator = scripted.make(self.env, len(kinds), self.recipe.noise)
         played = _play(demonstrator, simulations, kinds, length, own, progress)
         if not (np.abs(played.actions) <= 1.0).all():
             raise ValueError(f"{self.expert_id} acts outside [-1, 1], or with what is no number")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -18,6 +19,7 @@ from qdos_brax.collection.scripted.table import TableTarget, TableView
 CONTROL_STEP = 0.05  # s
 MOVE = np.array([0.05, 0.05, 0.05, 0.3, 1.0])
 """What an action of 1 asks for: m, m, m, rad, share of the gripper."""
+_numpy_generator = threading.Lock()
 _SMOOTHING = 0.5  # control steps, of the noise on a plan, as in OGBench
 
 
@@ -119,10 +121,14 @@ def _stand_in(env: ManipSpaceTask) -> Any:
 
 @contextmanager
 def _numpy_draws_from(rng: np.random.Generator) -> Iterator[None]:
-    """Let NumPy's global generator, which OGBench's oracles use, follow ``rng``, and be as before afterwards."""
-    before = np.random.get_state()
-    np.random.seed(int(rng.integers(2**32)))
-    try:
-        yield
-    finally:
-        np.random.set_state(before)
+    """Let NumPy's global generator, which OGBench's oracles use, follow ``rng``, and be as before afterwards.
+
+    Threads take turns, since there is one such generator.
+    """
+    with _numpy_generator:
+        before = np.random.get_state()
+        np.random.seed(int(rng.integers(2**32)))
+        try:
+            yield
+        finally:
+            np.random.set_state(before)
