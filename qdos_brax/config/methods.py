@@ -220,12 +220,25 @@ METHODS = {
         },
     ),
     # Wagenmaker et al. 2025, "Steering your diffusion policy with latent space reinforcement learning" (arXiv
-    # 2506.15799; code ajwagen/dsrl): SAC on noise that a box bounds, without the data (their DSRL-SAC; DSRL-NA has a
-    # second critic, on actions). Chunks of 4 actions, as their policies for robomimic and gym have.
+    # 2506.15799; code ajwagen/dsrl, its configurations of robomimic and gym): SAC on noise that a box bounds, without
+    # the data (their DSRL-SAC; DSRL-NA has a second critic, on actions). Chunks of 4 actions (transport: 8); 3 layers
+    # of 2,048 (hopper and transport: 128, halfcheetah: 1,024); 20 steps of everything per chunk (lift: 30); the box 1.5
+    # (walker: 2.5, transport: 1); the target entropy 0, the temperature 1 at first, as stable-baselines3 begins.
     "dsrl": Method(
         "SAC over the noise of a frozen flow clone of the data (DSRL, Wagenmaker et al. 2025)",
         low_level="noise",
-        settings={"skills.horizon": 4, "labels.rnd_coefficient": 0.0, "high_level.offline_fraction": 0.0},
+        settings={
+            "skills.horizon": 4,
+            "skills.latent_box": 1.5,
+            "high_level.hidden": [2048, 2048, 2048],
+            "high_level.ensemble": 2,
+            "high_level.target_subset": 2,
+            "high_level.actor_updates": 20,
+            "high_level.init_temperature": 1.0,
+            "high_level.target_entropy_scale": 0.0,
+            "high_level.offline_fraction": 0.0,
+            "labels.rnd_coefficient": 0.0,
+        },
     ),
     # Osa and Harada 2024, "Discovering multiple solutions from a single task in offline reinforcement learning": z of
     # dimension 2 from [-2, 2], which the high level draws on as the paper does on its own skills.
