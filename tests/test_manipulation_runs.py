@@ -31,8 +31,7 @@ def test_smoke_training(
     assert 0 <= member["eval_success"] <= member["eval_score"] <= 1
 
     page = (out / "report.html").read_text()
-    for title in ("Weight against quality", "Subtasks completed"):
-        assert title in page
+    assert "Weight against quality" in page and "Table 1, score" in page
     with np.load(out / "inside.npz") as found:
         assert {"gain", "return", "0/latent", "0/latents"} <= set(found)
         assert not {"walls", "0/grid"} & set(found)
