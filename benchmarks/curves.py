@@ -3,8 +3,9 @@
 One row per evaluation of a member: task, method, preset, view of the skills, alpha, seed, environment steps, success,
 score (the share of the task's parts that were done, where it has parts), steps of the first goal, minutes of the whole
 run, the command, with the name alone of a data file, for what learns offline alone the gradient steps so far, the
-view of all that learns (``observation.view``), the steps of a skill, and the run's name in a comparison. Rows of other
-runs that are in the file stay; rows of the same run (command, part of a comparison, steps of a skill) are replaced.
+view of all that learns (``observation.view``), the steps of a skill, the run's name in a comparison, and a member's
+values of what else a scan varies. Rows of other runs that are in the file stay; rows of the same run (command, part of
+a comparison, steps of a skill) are replaced.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from qdos_brax.runs.comparison import is_comparison
 COLUMNS = (
     *("env", "method", "preset", "view", "alpha", "seed"),
     *("env_steps", "eval_success", "eval_score", "first_goal_step", "minutes_of_the_run", "command", "update"),
-    *("observation_view", "horizon", "part"),
+    *("observation_view", "horizon", "part", "scanned"),
 )
 
 
@@ -45,10 +46,13 @@ def rows_of(study: Study) -> list[dict[str, str]]:
             "minutes_of_the_run": f"{run.summary['wall_seconds']['total'] / 60:.1f}",
             "command": " ".join(["python", "train.py", *kept[1:]]),
         }
+        values = [member.values for member in run.members]
+        scanned = [key for key in values[0] if key != "skills.alpha" and any(v[key] != values[0][key] for v in values)]
         for member in run.members:
             goal = "" if member.first_goal != member.first_goal else f"{member.first_goal:.0f}"
             own = {"env": member.task, "method": member.method, "seed": str(member.seed), "first_goal_step": goal}
             own["alpha"] = str(member.values.get("skills.alpha", ""))
+            own["scanned"] = " ".join(f"{key}={member.values[key]}" for key in scanned)
             for row in member.rows:
                 if row.get("eval/success"):
                     measured = {"eval_success": f"{float(row['eval/success']):.3g}"}

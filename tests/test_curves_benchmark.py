@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -30,3 +31,27 @@ def test_runs_of_a_comparison_do_not_replace_one_another(tmp_path: Path, monkeyp
     with out.open(newline="") as file:
         kept = [(found["part"], found["eval_success"]) for found in csv.DictReader(file)]
     assert kept == [("supe", "0.2"), ("qdos", "0.3")]
+
+
+def test_members_of_a_scan_are_told_apart(tmp_path: Path) -> None:
+    """By what it varies besides alpha and seed, which have columns."""
+
+    def member(seed: int, alpha: float, temperature: float) -> SimpleNamespace:
+        values = {"skills.alpha": alpha, "skills.advantage_temperature": temperature, "high_level.discount": 0.99}
+        rows = [{"eval/success": "0.5", "env_steps": "100", "update": ""}]
+        own = {"task": "a", "method": "qdos", "seed": seed, "first_goal": float("nan"), "rows": rows}
+        return SimpleNamespace(**own, values=values)
+
+    (tmp_path / "run.json").write_text('{"command": ["train.py", "--env", "a"]}')
+    config = SimpleNamespace(
+        skills=SimpleNamespace(view="start", horizon=10), observation=SimpleNamespace(view="task")
+    )  # fmt: skip
+    summary = {"preset": "cpu", "wall_seconds": {"total": 60.0}}
+    members = [member(10, 0.3, 1.0), member(10, 0.3, 1e6), member(11, 0.0, 1.0)]
+    run = SimpleNamespace(path=tmp_path, summary=summary, config=config, members=members)
+    found = curves.rows_of(SimpleNamespace(runs=[run]))  # type: ignore[arg-type]
+    assert [(row["seed"], row["alpha"], row["scanned"]) for row in found] == [
+        ("10", "0.3", "skills.advantage_temperature=1.0"),
+        ("10", "0.3", "skills.advantage_temperature=1000000.0"),
+        ("11", "0.0", "skills.advantage_temperature=1.0"),
+    ]
