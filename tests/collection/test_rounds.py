@@ -86,7 +86,7 @@ def test_a_failure_ends_the_rounds_beside_it(monkeypatch: pytest.MonkeyPatch) ->
     rounds = Rounds(play)
     with pytest.raises(UserError, match="it broke"):
         run(rounds, 9, [])
-    assert stopped and 0 in stopped and len(rounds.begun) <= 3
+    assert 0 in stopped and len(rounds.begun) <= 3
 
 
 def test_rounds_at_once_give_the_rows_of_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
