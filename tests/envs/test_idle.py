@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs.physics.mujoco.stepper import _ViewKeepingBatch
+from envs.physics.mujoco.stepper import BatchStepper
 
 N = 4
 OVER = jnp.arange(N) % 2 == 1
@@ -18,13 +18,13 @@ OVER = jnp.arange(N) % 2 == 1
 def test_idle_simulations_are_not_stepped_and_change_no_other(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     env = envs.make(task, physics="mujoco")
     stepped = []
-    steps = _ViewKeepingBatch.step
+    sub_steps = BatchStepper._sub_steps
 
-    def counted(batch, ids=None, **kwargs):
+    def counted(stepper, batch, ids):
         stepped.append(N if ids is None else len(ids))
-        steps(batch, ids=ids, **kwargs)
+        sub_steps(stepper, batch, ids)
 
-    monkeypatch.setattr(_ViewKeepingBatch, "step", counted)
+    monkeypatch.setattr(BatchStepper, "_sub_steps", counted)
     step = jax.jit(jax.vmap(lambda state, action, over: env.step(env.idle(state, over), action)))
     one = other = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), N))
     for k in range(5):
