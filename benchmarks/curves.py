@@ -19,7 +19,7 @@ from pathlib import Path
 
 from qdos_brax.errors import guarded
 from qdos_brax.files import write_text
-from qdos_brax.report.study import Study, read_study
+from qdos_brax.report.study import Study, read_study, varied_keys
 from qdos_brax.runs.comparison import is_comparison
 
 COLUMNS = (
@@ -46,8 +46,7 @@ def rows_of(study: Study) -> list[dict[str, str]]:
             "minutes_of_the_run": f"{run.summary['wall_seconds']['total'] / 60:.1f}",
             "command": " ".join(["python", "train.py", *kept[1:]]),
         }
-        values = [member.values for member in run.members]
-        scanned = [key for key in values[0] if key != "skills.alpha" and any(v[key] != values[0][key] for v in values)]
+        scanned = [key for key in varied_keys(run.members, run.config.method) if key != "skills.alpha"]
         for member in run.members:
             goal = "" if member.first_goal != member.first_goal else f"{member.first_goal:.0f}"
             own = {"env": member.task, "method": member.method, "seed": str(member.seed), "first_goal_step": goal}

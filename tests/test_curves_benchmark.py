@@ -44,7 +44,7 @@ def test_members_of_a_scan_are_told_apart(tmp_path: Path) -> None:
 
     (tmp_path / "run.json").write_text('{"command": ["train.py", "--env", "a"]}')
     view = SimpleNamespace(view="start", horizon=10)
-    config = SimpleNamespace(skills=view, observation=view)
+    config = SimpleNamespace(method="qdos", skills=view, observation=view)
     summary = {"preset": "cpu", "wall_seconds": {"total": 60.0}}
     members = [member(10, 0.3, 1.0), member(10, 0.3, 1e6), member(11, 0.0, 1.0)]
     run = SimpleNamespace(path=tmp_path, summary=summary, config=config, members=members)

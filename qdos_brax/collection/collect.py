@@ -57,7 +57,7 @@ class EpisodeCollector(Protocol):
             length: control steps of an episode, a multiple of ``chunk_steps``.
             seed: seed of the whole collection.
             turn: how many times the n were collected before; other turns have other random numbers.
-            progress: called with the number of rows so far, now and then.
+            progress: called with the number of rows so far, now and then; what it raises ends the episodes.
 
         Returns:
             arrays[n * length, ..] by their name in the file: observations, actions, next_observations, timeouts,

@@ -229,7 +229,7 @@ def _provenance(folder: RunFolder) -> dict[str, Any]:
 
 def _settings(members: Sequence[Member]) -> list[Setting]:
     """Group members with the same method and equal values, whatever their run folders."""
-    varied = {method: _varied(members, method) for method in dict.fromkeys(member.method for member in members)}
+    varied = {method: varied_keys(members, method) for method in dict.fromkeys(member.method for member in members)}
     settings: dict[tuple[str, ...], Setting] = {}
     for member in members:
         values = {key: member.values[key] for key in varied[member.method]}
@@ -255,7 +255,7 @@ def _named(member: Member, values: dict[str, Any], members: Sequence[Member]) ->
     return scanned if len(own) == len(others) else {"run": member.run, **scanned}
 
 
-def _varied(members: Sequence[Member], method: str) -> list[str]:
+def varied_keys(members: Sequence[Member], method: str) -> list[str]:
     """Return the keys in which members of the method differ on the same task."""
     keys: dict[str, None] = {}
     for task in dict.fromkeys(member.task for member in members):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ class Rounds:
 
     def __init__(self, play: Callable[[int, Callable[[int], None]], None]) -> None:
         real = collector("antmaze-medium", "mixed")
-        self.env, self.recipe, self._play = real.env, real.recipe, play
+        self.env, self.recipe, self._play = real.env, replace(real.recipe, episode_steps=LENGTH), play
         self.begun: list[int] = []
 
     def episodes(
@@ -48,8 +49,7 @@ def run(rounds: Rounds, count: int, seen: list[tuple[int, int]]) -> dict[str, np
     return collect(rounds, count * LENGTH, seed=0, num_envs=1, progress=lambda *at: seen.append(at))
 
 
-def test_two_rounds_run_at_once_and_stay_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("qdos_brax.collection.collect.episode_length", lambda *_: LENGTH)
+def test_two_rounds_run_at_once_and_stay_in_order() -> None:
     second = threading.Event()
 
     def play(turn: int, progress: Callable[[int], None]) -> None:
@@ -68,8 +68,7 @@ def test_two_rounds_run_at_once_and_stay_in_order(monkeypatch: pytest.MonkeyPatc
     assert 50 in np.diff([0, *done])
 
 
-def test_a_failure_ends_the_rounds_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("qdos_brax.collection.collect.episode_length", lambda *_: LENGTH)
+def test_a_failure_ends_the_rounds_beside_it() -> None:
     stopped: list[int] = []
 
     def play(turn: int, progress: Callable[[int], None]) -> None:

@@ -30,7 +30,7 @@ class Demonstrator(Protocol):
 
     A class is registered by the name of its family of tasks (``qdos_brax.collection.scripted``). What it remembers
     between two steps (a plan, a goal, a counter) it keeps itself; ``begin`` forgets all of it, since one demonstrator
-    plays many episodes, one after another. All its random numbers come from the generators it is given.
+    may play many episodes, one after another. All its random numbers come from the generators it is given.
 
     Args:
         env: the task; the set serves all tasks of its variant, so that goals are the demonstrator's own choice.
