@@ -24,7 +24,6 @@ from qdos_brax.collection import default_set
 from qdos_brax.data import formats, quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import DeviceData, to_device
-from qdos_brax.data.segments import window
 from qdos_brax.errors import guarded
 from qdos_brax.methods.learners_view import learners_env, run_dataset
 from qdos_brax.methods.low_level_kinds import make_skill_model, value_phase
@@ -33,7 +32,7 @@ from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.skills.graph_phase import GraphPhase
 from qdos_brax.skills.segment_weights import LatentWeights, SegmentBatch
 from qdos_brax.skills.skill_phase import SkillPhase
-from qdos_brax.skills.vae import Segments
+from qdos_brax.skills.vae import segments_at
 from qdos_brax.skills.value_phase import ValuePhase, over_rows
 from qdos_brax.skills.values import IQL
 from qdos_brax.skills.weights import advantage_weights, scaled_advantage
@@ -115,7 +114,7 @@ def latent_scores(
 
     @jax.jit
     def latent(index: jax.Array) -> jax.Array:
-        segments = Segments(*window((data.observations, data.actions), data.starts[index], skills.horizon))
+        segments = segments_at(data, data.starts[index], skills.horizon, model.reach)
         batch = SegmentBatch(
             index, data.observations[data.starts[index]], lambda: model.encode(learned.params, segments).mean
         )

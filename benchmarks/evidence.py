@@ -1,7 +1,8 @@
 """Measure QDOS's two mechanisms without RL: ``python benchmarks/evidence.py --env TASK --seed 0,1,2 --out DIR``.
 
 Trains values and skills alone, for every seed with weights on and off and the mutual-information term off, as in the
-paper (``segment``), and on outcomes (``outcome``, random skills drawn where the agent plays), in every ``--view``. Then
+paper (``segment``), and on outcomes (``outcome``, random skills drawn where the agent plays), in every ``--view`` of
+the trajectory VAE, and for skills that are outcomes themselves (the view ``outcome``, without the paper's term). Then
 measures each as ``benchmarks/skills.py`` does. All arms of a view and an encoder are the members of one program, so
 that a seed's data, values and first parameters are shared by its arms.
 
@@ -39,6 +40,7 @@ from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.runs.loop import run_phases
 
+OUTCOMES = "outcome"
 NO_WEIGHTS = 1e6  # lambda: exp(A / lambda) is 1 for every advantage
 ARM = ("view", "weights", "information")
 BEFORE_ONLINE = ("values", "skills")
@@ -52,14 +54,24 @@ class Program(NamedTuple):
 
 
 def programs(views: Sequence[str], temperature: float, alpha: float, outcome_alpha: float) -> list[Program]:
-    """Return the programs of all arms; the arms without the term are the segment programs' members of alpha 0."""
+    """Return the programs of all arms; the arms without the term are the segment programs' members of alpha 0, and of
+    the view "outcome", skills that are outcomes, its own.
+    """
     temperatures = {"skills.advantage_temperature": [temperature, NO_WEIGHTS]}
+    outcome = {"skills.mi_encoder": "outcome", "skills.mi_latent": "played"}
     found = []
     for view in views:
-        shared = {"skills.view": view} | temperatures
+        if view == OUTCOMES:
+            skills = {"skills.model": "outcome", "skills.view": "body", "skills.alpha": [0.0, outcome_alpha]}
+            found.append(Program(view, temperatures | outcome | skills))
+            continue
+        latents = {"skills.model": "vae", "skills.latent_dim": Config().skills.latent_dim}
+        shared = temperatures | latents | {"skills.view": view}
         paper = {"skills.mi_encoder": "segment", "skills.mi_latent": "box", "skills.alpha": [0.0, alpha]}
-        outcome = {"skills.mi_encoder": "outcome", "skills.mi_latent": "played", "skills.alpha": outcome_alpha}
-        found += [Program(f"{view}-segment", shared | paper), Program(f"{view}-outcome", shared | outcome)]
+        found += [
+            Program(f"{view}-segment", shared | paper),
+            Program(f"{view}-outcome", shared | outcome | {"skills.alpha": outcome_alpha}),
+        ]
     return found
 
 
@@ -67,7 +79,7 @@ def arm_of(config: Config, member: dict[str, Any]) -> dict[str, Any]:
     """Return the arm that a member belongs to, and its seed."""
     off = member.get("skills.advantage_temperature", config.skills.advantage_temperature) == NO_WEIGHTS
     return {
-        "view": config.skills.view,
+        "view": OUTCOMES if config.skills.model == "outcome" else config.skills.view,
         "weights": "off" if off else "on",
         "information": config.skills.mi_encoder if member["alpha"] else "off",
         "seed": member["seed"],
@@ -144,9 +156,11 @@ def main() -> None:
     parser.add_argument("--seed", default="0,1,2,3,4,5", help="seeds, separated by commas (default 0 to 5)")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="the folder of the table and its runs")
     parser.add_argument("--preset", default="cpu", help="sizes (default cpu)")
-    parser.add_argument("--view", default="start", help="values of skills.view, separated by commas (default start)")
+    parser.add_argument(
+        "--view", default="start", help="values of skills.view, and outcome, separated by commas (default start)"
+    )
     parser.add_argument("--temperature", type=float, help="lambda where weights are on (default: the task's)")
-    parser.add_argument("--alpha", type=float, help="weight of the paper's term (default: the task's)")
+    parser.add_argument("--alpha", type=float, default=0.3, help="weight of the paper's term (default 0.3)")
     parser.add_argument("--outcome-alpha", type=float, default=3.0, help="weight of the term on outcomes (default 3)")
     parser.add_argument("--set", metavar="KEY=VALUE", nargs="+", default=[], dest="settings", help="further settings")
     parser.add_argument("--draws", type=int, default=16, help="skills drawn in each state (default 16)")
@@ -160,7 +174,7 @@ def main() -> None:
     dataset = formats.read(default_dataset(env, **dataclasses.asdict(config.data)), env)
     temperature = args.temperature or config.skills.advantage_temperature
     rows: list[dict[str, Any]] = []
-    for program in programs(args.view.split(","), temperature, args.alpha or config.skills.alpha, args.outcome_alpha):
+    for program in programs(args.view.split(","), temperature, args.alpha, args.outcome_alpha):
         rows += run_program(program, config, env, dataset, args)
     args.out.mkdir(parents=True, exist_ok=True)
     write_rows(args.out / "evidence.csv", rows)

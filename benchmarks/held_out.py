@@ -23,13 +23,12 @@ from qdos_brax.data import formats
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import Normaliser, to_device
 from qdos_brax.data.quality import QUALITY
-from qdos_brax.data.segments import window
 from qdos_brax.errors import guarded
 from qdos_brax.methods.learners_view import learners_dataset
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.jax_setup import prepare_jax
 from qdos_brax.skills.low_level import LowLevelPolicy
-from qdos_brax.skills.vae import Segments
+from qdos_brax.skills.vae import Segments, segments_at
 
 
 def squared_error(low_level: LowLevelPolicy, params: Any, segments: Segments, after: jax.Array) -> jax.Array:
@@ -39,9 +38,9 @@ def squared_error(low_level: LowLevelPolicy, params: Any, segments: Segments, af
         low_level: the skills.
         params: theirs.
         segments: windows, observations normalised.
-        after: [B, obs], the observation behind each window's last action, normalised.
+        after: [B, obs], what the posterior is told of what came after, normalised.
     """
-    observations, actions = segments
+    observations, actions = segments.observations, segments.actions
     latent = low_level.posterior(params, segments, after).mean
     skill = low_level.begin(params, latent, observations[:, 0])
     steps = range(observations.shape[1])
@@ -58,12 +57,12 @@ def errors(
     pools = {"all": starts}
     if dataset.quality is not None:
         pools["good"] = starts[dataset.quality[starts] == QUALITY["navigate"]]
-    measure = jax.jit(lambda segments, after: squared_error(low_level, params, segments, after).mean())
+    measure = jax.jit(lambda segments: squared_error(low_level, params, segments, segments.later).mean())
     rng, found = np.random.default_rng(0), {}
     for name, pool in pools.items():
         chosen = jnp.asarray(rng.choice(pool, min(count, len(pool)), replace=False))
-        segments = Segments(*window((data.observations, data.actions), chosen, horizon))
-        found[name] = float(measure(segments, data.next_observations[chosen + horizon - 1]))
+        segments = segments_at(data, chosen, horizon, low_level.reach or horizon)
+        found[name] = float(measure(segments))
     return found
 
 

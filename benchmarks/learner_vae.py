@@ -50,7 +50,7 @@ def reference_vae() -> Calls:
     encoder, prior, decoder = Encoder(), DiagonalGaussian((256, 256), LATENT), DiagonalGaussian((256, 256), ACTION)
     segments, optimiser = windows(), optax.adam(RATE)
     parameters = {
-        "encoder": encoder.init(jax.random.key(0), *segments),
+        "encoder": encoder.init(jax.random.key(0), segments.observations, segments.actions),
         "prior": prior.init(jax.random.key(1), segments.observations[:, 0]),
         "decoder": decoder.init(jax.random.key(2), jnp.zeros((1, OBSERVATION + LATENT))),
     }
@@ -58,7 +58,7 @@ def reference_vae() -> Calls:
     @jax.jit
     def update(parameters: Any, opt_state: Any, key: jax.Array) -> tuple[Any, Any]:
         def loss(parameters: Any) -> jax.Array:
-            posterior = encoder.apply(parameters["encoder"], *segments)
+            posterior = encoder.apply(parameters["encoder"], segments.observations, segments.actions)
             latent = gaussian_sample(key, *posterior)
             repeated = jnp.broadcast_to(latent[:, None], (BATCH, HORIZON, LATENT))
             action = decoder.apply(parameters["decoder"], jnp.concatenate([segments.observations, repeated], axis=-1))

@@ -22,6 +22,8 @@ WALL = 1.3  # m between the body and the nearest wall's face, at most, of a stat
 AWAY = 1.5  # m
 WAY_SECONDS = 2.0  # short skills have as long as a long one
 MOVED = 0.02  # m or rad
+BEHIND = 1.0  # m, from the ball
+_COMPASS = 16  # ways for the ball that are compared
 NEAREST = 5  # logged states that tell the cost to go
 
 
@@ -82,15 +84,38 @@ class MazeTruth:
         return far[:, at_walls(self._env, np.asarray(before.pipeline_state.qpos))]
 
 
-class ArmTruth:
-    """Measure what an arm does to things, and the cost to go on the graph of logged states.
+class BallTruth(MazeTruth):
+    """Measure ways on the floor of a body that pushes a ball: to where it has to stand, then the ball's.
+
+    Args:
+        env: a maze with a ball.
+    """
+
+    def left(self, states: State) -> np.ndarray:
+        """Return the way of the body to the place ``BEHIND`` the ball, and twice the ball's to the goal.
+
+        Behind is where the ball's own way does not lead. The way to the ball itself would call it a step back to walk
+        around it.
+        """
+        qpos = np.asarray(states.pipeline_state.qpos)
+        body, ball = self._env.position(qpos.reshape(-1, qpos.shape[-1])).values()
+        distance, goal = self._env.layout.distance, self._env.goal_xy
+        angles = np.arange(_COMPASS) * 2 * np.pi / _COMPASS
+        around = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        ahead = np.stack([distance(ball + BEHIND * way, goal) for way in around])
+        place = ball - BEHIND * around[ahead.argmin(axis=0)]
+        walk = distance(body, place)
+        walk = np.where(np.isfinite(walk), walk, distance(body, ball) + BEHIND)  # the place is in a wall
+        return np.nan_to_num(walk + 2 * distance(ball, goal), posinf=1e3).reshape(qpos.shape[:-1])
+
+
+class GraphValues:
+    """Tell the cost to go on the graph of logged states, which weighs the segments in training.
 
     Args:
         trained: the run, which says how the graph is made.
         dataset: its data.
     """
-
-    reach_name, reach_steps = "moves_things", 0
 
     def __init__(self, trained: TrainedRun, dataset: Dataset) -> None:
         values, horizon = trained.config.values, trained.config.skills.horizon
@@ -99,31 +124,52 @@ class ArmTruth:
         self._features = fit_slow_features(*seen, np.asarray(data.starts), horizon, values.slowness)
         self._tree = KDTree(self._features(seen[0]))
         self._costs, self._jump = graph_costs(values, horizon, data, dataset.ends), horizon * values.jump_cost
-        self._things = ROBOT_JOINTS if hasattr(trained.env, "rig") else JOINTS
 
     def left(self, states: State) -> np.ndarray:
         """Return the cost to go of the nearest logged states, the way to them included."""
-        features = self._of(states)
+        features = self.features(states)
         distance, rows = self._tree.query(features.reshape(-1, features.shape[-1]), NEAREST, workers=-1)
         return (self._costs[rows] + self._jump * distance).min(axis=1).reshape(features.shape[:-1]).astype(np.float64)
 
+    def features(self, states: State) -> np.ndarray:
+        """Return the graph's features of the states, [..., F]."""
+        seen = np.asarray(self._normalise(states.obs))
+        return self._features(seen.reshape(-1, seen.shape[-1])).reshape(*seen.shape[:-1], -1)
+
+
+class ArmTruth:
+    """Measure what an arm does to things, and the cost to go on the graph of logged states.
+
+    Args:
+        trained: the run.
+        values: of its data.
+    """
+
+    reach_name, reach_steps = "moves_things", 0
+
+    def __init__(self, trained: TrainedRun, values: GraphValues) -> None:
+        self._values = values
+        self._things = ROBOT_JOINTS if hasattr(trained.env, "rig") else JOINTS
+
+    def left(self, states: State) -> np.ndarray:
+        """Return the values' cost to go."""
+        return self._values.left(states)
+
     def outcome(self, before: State, after: State) -> np.ndarray:
         """Return the change of the graph's features."""
-        return self._of(after) - self._of(before)
+        return self._values.features(after) - self._values.features(before)
 
     def reach(self, before: State, after: State) -> np.ndarray:
         """Return whether anything but the arm moves."""
         start, end = (np.asarray(states.pipeline_state.qpos)[..., self._things :] for states in (before, after))
         return (np.abs(end - start) > MOVED).any(axis=-1)
 
-    def _of(self, states: State) -> np.ndarray:
-        seen = np.asarray(self._normalise(states.obs))
-        return self._features(seen.reshape(-1, seen.shape[-1])).reshape(*seen.shape[:-1], -1)
 
-
-def truth_of(trained: TrainedRun, dataset: Dataset) -> Truth:
-    """Return what can be measured of a run's task."""
-    return MazeTruth(trained.env) if trained.env.floor_map() else ArmTruth(trained, dataset)
+def truth_of(trained: TrainedRun, values: GraphValues) -> Truth:
+    """Return what can be measured of a run's task, of whose data ``values`` are."""
+    if trained.env.floor_map() is None:
+        return ArmTruth(trained, values)
+    return (BallTruth if trained.env.body_frame.points else MazeTruth)(trained.env)
 
 
 def at_walls(env: Any, qpos: np.ndarray) -> np.ndarray:

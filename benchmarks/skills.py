@@ -10,12 +10,13 @@ Plays draws from the skill prior in the simulator, of every member of a finished
   from which WAY_SECONDS of skills lead more than AWAY away, each the draw that leads furthest; for an arm all states,
   where a draw moves a thing by MOVED;
 - random skills, one after the other: success and best score of whole episodes;
-- the oracle: success, score and steps of episodes in which the draw of most progress is played;
+- the oracle: success, score and steps of episodes in which the draw of most progress is played, by the truth and by
+  what training knows (V, the cost to go of the nearest logged states on the graph that weighs segments too);
 - the search, which looks further ahead than one skill (``benchmarks/skill_search.py``): success, score, steps.
 
 In mazes progress is the true decrease of the shortest path to the goal, which training never sees, and an outcome is
-where the body got, as seen from its start. An arm has no such truth: progress is the decrease of the cost to go of the
-nearest logged states on the graph that weighs segments too, and an outcome is the change of its features.
+where the body got, as seen from its start. With a ball the path is the body's to where it can push the ball its way,
+and twice the ball's. An arm has no such truth: progress is that of V, and an outcome is the change of its features.
 
 Prints a table and writes CSV.
 """
@@ -33,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from regression import r2
 from skill_search import searches
-from skill_truths import Truth, truth_of
+from skill_truths import ArmTruth, GraphValues, Truth, truth_of
 from table import aligned, write_rows
 
 from envs.brax_base import State
@@ -163,21 +164,25 @@ def play_episodes(skills: Skills, choose: Callable[[State, Any], np.ndarray], ep
     return Episodes(done, np.where(done, 1.0, score), steps)
 
 
-def whole_episodes(skills: Skills, truth: Truth, episodes: int) -> dict[str, float]:
-    """Return how random skills and the oracle do."""
+def whole_episodes(skills: Skills, truth: Truth, values: GraphValues, episodes: int) -> dict[str, float]:
+    """Return how random skills and the two oracles do; of an arm they are one."""
+    at_random = play_episodes(skills, lambda before, _: np.zeros(len(before.reward), int), episodes)
+    found = {"random_success": float(at_random.success.mean()), "random_score": float(at_random.score.mean())}
+    found |= oracle_episodes("oracle", skills, truth.left, episodes)
+    return found if isinstance(truth, ArmTruth) else found | oracle_episodes("v_oracle", skills, values.left, episodes)
+
+
+def oracle_episodes(name: str, skills: Skills, left: Callable[[State], np.ndarray], episodes: int) -> dict[str, float]:
+    """Return how the choice of the draw after which least is left does, under the names that begin with ``name``."""
 
     def most_progress(before: State, found: Any) -> np.ndarray:
-        gain = truth.left(before) - truth.left(found["end"])
-        return np.where(np.asarray(found["success"]), np.inf, gain).argmax(axis=0)
+        return np.where(np.asarray(found["success"]), np.inf, left(before) - left(found["end"])).argmax(axis=0)
 
-    at_random = play_episodes(skills, lambda before, _: np.zeros(len(before.reward), int), episodes)
     oracle = play_episodes(skills, most_progress, episodes)
     return {
-        "random_success": float(at_random.success.mean()),
-        "random_score": float(at_random.score.mean()),
-        "oracle_success": float(oracle.success.mean()),
-        "oracle_score": float(oracle.score.mean()),
-        "oracle_steps": float(oracle.steps[oracle.success].mean()) if oracle.success.any() else np.nan,
+        f"{name}_success": float(oracle.success.mean()),
+        f"{name}_score": float(oracle.score.mean()),
+        f"{name}_steps": float(oracle.steps[oracle.success].mean()) if oracle.success.any() else np.nan,
     }
 
 
@@ -212,12 +217,13 @@ def measure_members(
         number: of searches; 0 makes none.
     """
     dataset = run_dataset(trained.config, trained.env, dataset)
-    truth, rows = truth_of(trained, dataset), []
+    values = GraphValues(trained, dataset)
+    truth, rows = truth_of(trained, values), []
     for member, known in enumerate(about):
         started = time.perf_counter()
         skills = Skills(trained, member, draws)
         found = from_logged_states(skills, truth, dataset, states)
-        found |= whole_episodes(skills, truth, episodes) if episodes else {}
+        found |= whole_episodes(skills, truth, values, episodes) if episodes else {}
         found |= searches(Skills(trained, member, 1), truth.left, number) if number else {}
         rows.append(known | found | {"seconds": time.perf_counter() - started})
         print(f"{member + 1} of {len(about)} members measured, {rows[-1]['seconds']:.0f} s", flush=True)

@@ -90,6 +90,32 @@ class BodyFrame:
         """Return float[..., obs + 2 points], the observation in the body's present frame."""
         return self.see(observation, self.pose(observation))
 
+    def gaps(self, observation: jax.Array) -> jax.Array:
+        """Return float[..., points, 2], each other point's place as seen from the body's present pose, in own units."""
+        place, facing = _pair(observation, self.place), self._facing(observation)
+        gaps = [_turned(_pair(observation, index) - place, facing) for index in self.points]
+        return jnp.stack(gaps, axis=-2) if gaps else jnp.zeros((*observation.shape[:-1], 0, 2))
+
+    @property
+    def ways_size(self) -> int:
+        """Return the numbers of ``ways``."""
+        return 2 * (1 + len(self.points))
+
+    def ways(self, before: jax.Array, after: jax.Array) -> jax.Array:
+        """Return float[..., 2 (1 + points)], how far body and other points got, x and y of each in the world's axes.
+
+        Args:
+            before: [..., obs], in its own units.
+            after: [..., obs], likewise.
+        """
+        places = (self.place, *self.points)
+        return jnp.concatenate([_pair(after, index) - _pair(before, index) for index in places], axis=-1)
+
+    def turned_ways(self, ways: jax.Array, pose: jax.Array) -> jax.Array:
+        """Return ``ways[..., 2 (1 + points)]`` as seen by a body in ``pose[..., 4]``: ahead of it, and to its left."""
+        pairs = [_turned(_pair(ways, index), pose[..., 2:]) for index in range(0, self.ways_size, 2)]
+        return jnp.concatenate(pairs, axis=-1)
+
     def _facing(self, observation: jax.Array) -> jax.Array:
         """Return (cos yaw, sin yaw)[..., 2]."""
         if self.heading is not None:

@@ -31,6 +31,16 @@ def test_every_arm_is_there_once_for_every_seed() -> None:
     assert len(found) == len(expected) and {tuple(arm.values()) for arm in found} == expected
 
 
+def test_skills_that_are_outcomes_have_arms_without_the_papers_term() -> None:
+    asked = configs.load_config("antmaze-large", "cpu")
+    (program,) = evidence.programs(["outcome"], 1.0, 0.3, 3.0)
+    config = configs.replace(asked, **program.settings)
+    found = {tuple(evidence.arm_of(config, member).values()) for member in configs.members(config)}
+    assert found == {("outcome", weights, term, 0) for weights in ("on", "off") for term in ("off", "outcome")}
+    (vae, _) = evidence.programs(["start"], 1.0, 0.3, 3.0)
+    assert configs.replace(asked, **vae.settings).skills.model == "vae"
+
+
 def test_an_arms_cell_is_the_mean_over_seeds_with_its_interval() -> None:
     """Of two seeds the bootstrap draws (a, a), (a, b), (b, a), (b, b): the interval of 95 % reaches from a to b."""
     rows = [

@@ -18,6 +18,8 @@ from qdos_brax.skills.vae import Segments
 class Known:
     """The latent is the segment's first action; a skill plays it, a tenth more at every step."""
 
+    reach = None
+
     def posterior(self, params: Any, segments: Segments, after: Any) -> Any:
         return SimpleNamespace(mean=segments.actions[:, 0])
 

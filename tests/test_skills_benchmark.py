@@ -90,6 +90,18 @@ def test_an_outcome_counts_from_where_the_body_faces() -> None:
     np.testing.assert_allclose(truth.outcome(before, after), [[[2.0, -1.0]], [[0.0, 0.0]]], atol=1e-6)
 
 
+def test_with_a_ball_the_way_leads_around_it() -> None:
+    """The goal lies east of the ball in an open arena: who stands a metre west of the ball has no way left to walk."""
+    env = envs.make("antsoccer-arena-task1", physics="mujoco")
+    truth = skill_truths.BallTruth(env)
+    goal = np.asarray(env.goal_xy, float)
+    qpos = np.zeros((3, 22))
+    qpos[:, 15:17] = goal - [4.0, 0.0]
+    for row, body in enumerate(([-5.0, 0.0], [-3.0, 0.0], [-5.0, 3.0])):
+        qpos[row, :2] = goal + body
+    np.testing.assert_allclose(truth.left(state(qpos)), [8.0, 2.0 + 8.0, 3.0 + 8.0], atol=1e-3)
+
+
 class Walk:
     """Skills of two steps that go one to the left or one to the right; success is ``far`` to the right."""
 

@@ -19,7 +19,7 @@ from qdos_brax.data import quality
 from qdos_brax.data.dataset import Dataset
 from qdos_brax.data.device import Normaliser
 from qdos_brax.data.exchange import exchanged
-from qdos_brax.data.segments import segment_starts
+from qdos_brax.data.segments import episode_last, rows_ahead, segment_starts
 from qdos_brax.files import write_arrays
 from qdos_brax.methods.learners_view import learners_observations
 from qdos_brax.methods.low_level_kinds import make_low_level
@@ -169,7 +169,10 @@ class _LatentView:
     def __init__(self, trained: TrainedRun, sample: _Sample) -> None:
         horizon, dataset, rows = trained.config.skills.horizon, sample.dataset, sample.rows
         # Of the sample's rows alone: the whole data on the device a second time would be the run's peak of memory.
-        logged = (dataset.observations[rows], dataset.next_observations[rows[:, -1]])
+        low_level = make_low_level(trained.config, trained.env)
+        starts, last = jnp.asarray(rows[:, 0]), jnp.asarray(episode_last(dataset.ends))
+        after = np.asarray(rows_ahead(starts, last, low_level.reach or horizon))
+        logged = (dataset.observations[rows], dataset.next_observations[after])
         taken: Any = [learners_observations(trained.env, observations) for observations in logged]
         # All members have one normaliser. In NumPy, for which nothing is compiled.
         own = jax.tree.map(lambda leaf: np.asarray(leaf)[0], trained.artifacts["normaliser"])
@@ -177,7 +180,7 @@ class _LatentView:
         self._trained = trained
         self._segments = Segments(observations, jnp.asarray(dataset.actions[rows]))
         self._steps = min(_HELD * horizon, trained.env.episode_length)
-        self._posterior = jax.jit(make_low_level(trained.config, trained.env).posterior)
+        self._posterior = jax.jit(low_level.posterior)
         self._play = jax.jit(jax.vmap(self._path, in_axes=(None, None, 0)))
 
     def of(self, member: int) -> Arrays:

@@ -17,6 +17,7 @@ from qdos_brax.config.layers import Layer, flat, known_keys, known_method, merge
 from qdos_brax.config.methods import METHODS
 from qdos_brax.config.rules import choices_in, convert
 from qdos_brax.config.schema import Config, leaves, plain
+from qdos_brax.config.skill_groups import SkillsConfig
 from qdos_brax.errors import UserError
 
 
@@ -161,6 +162,8 @@ def check_method(config: Config) -> None:
 
 _LEAST_TRIALS = 4  # within the window, about; the guard counts three before it prefers any
 _AS_BEFORE = {
+    ("skills", "model"): "vae",
+    ("skills", "outcome_steps"): 40,
     ("skills", "view"): "world",
     ("skills", "schedule"): "constant",
     ("skills", "least_std"): 0.0,
@@ -262,7 +265,21 @@ def _check_together(config: Config) -> None:
         )
     if config.skills.mi_encoder == "outcome" and config.skills.mi_rollout != "physics":
         raise UserError("skills.mi_encoder=outcome needs skills.mi_rollout=physics: logged states are no outcome of z")
-    if config.skills.mi_encoder == "outcome" and config.skills.view == "body":
+    if config.skills.model == "outcome":
+        _check_outcomes(config.skills)
+    elif config.skills.mi_encoder == "outcome" and config.skills.view == "body":
         raise UserError(
             "skills.mi_encoder=outcome needs skills.view=start or world: the body's present frame hides where it got"
+        )
+
+
+def _check_outcomes(skills: SkillsConfig) -> None:
+    """Check what skills that are outcomes need."""
+    if skills.view != "body":
+        raise UserError(f"skills.model=outcome needs skills.view=body, not {skills.view}: it says where its body faces")
+    if skills.mi_encoder != "outcome":
+        raise UserError("skills.model=outcome needs skills.mi_encoder=outcome: there is no posterior of actions")
+    if skills.outcome_steps < skills.horizon:
+        raise UserError(
+            f"skills.outcome_steps ({skills.outcome_steps}) must not be less than skills.horizon ({skills.horizon})"
         )

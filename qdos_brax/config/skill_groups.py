@@ -96,6 +96,14 @@ class SkillsConfig:
     """Configure the advantage-weighted trajectory VAE and the mutual information of its skills."""
 
     horizon: int = count(20, "environment steps H of a segment and of a macro step; 1 for methods without skills")
+    model: str = choice(
+        "vae",
+        "what a skill is: vae (the latent of a trajectory VAE, as in the paper) or outcome (how far body and things "
+        "get in the next outcome_steps; for tasks whose body moves in a plane, with view=body and mi_encoder=outcome)",
+        "vae",
+        "outcome",
+    )
+    outcome_steps: int = count(40, "(model outcome) steps ahead of which a skill says what happens; H or more")
     latent_dim: int = count(8, "size of the skill z")
     view: str = choice(
         "world",

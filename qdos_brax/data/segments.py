@@ -42,6 +42,13 @@ def window(tree: Tree, starts: jax.Array, horizon: int) -> Tree:
     return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
+def rows_ahead(starts: jax.Array, last: jax.Array, steps: int) -> jax.Array:
+    """Return the row whose next observation lies ``steps`` steps after each of the rows ``starts[B]``, or the last row
+    of its episode; ``last``: int[N], the last row of each row's episode.
+    """
+    return jnp.minimum(starts + steps - 1, last[starts])
+
+
 def macro_return(rewards: jax.Array, masks: jax.Array, discount: float | jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return a window's reward and mask as one macro step.
 

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from qdos_brax.data.device import DeviceData
-from qdos_brax.data.segments import window
+from qdos_brax.data.segments import rows_ahead, window
 from qdos_brax.nn.networks import gaussian_sample
 from qdos_brax.population.phase import MemberPhase
 from qdos_brax.skills.low_level import LowLevelPolicy
@@ -81,7 +81,7 @@ class LabelPhase(MemberPhase):
 
         def encode(start: jax.Array) -> tuple[jax.Array, jax.Array]:
             segment = window((data.observations, data.actions), start[None], self._horizon)
-            after = data.next_observations[start + self._horizon - 1]
+            after = data.next_observations[rows_ahead(start, data.last, self._low_level.reach or self._horizon)]
             mean, log_std = self._low_level.posterior(skills, Segments(*segment), after[None])
             return mean[0], log_std[0]
 

@@ -30,6 +30,7 @@ from qdos_brax.skills.low_level import (
     TrajectorySkills,
     TransitionSkills,
 )
+from qdos_brax.skills.outcome_model import OutcomeModel
 from qdos_brax.skills.outcome_term import OutcomeTerm
 from qdos_brax.skills.outcomes import fit_outcomes, seen_paths
 from qdos_brax.skills.segment_weights import LatentWeights, LoggedWeights, SegmentWeights, UniformWeights
@@ -60,7 +61,9 @@ class _LowLevelKind(NamedTuple):
 
 
 def make_skill_model(config: Config, env: SpaceSizes) -> SkillModel:
-    """Return the trajectory VAE of a configuration."""
+    """Return the skill model of a configuration: the trajectory VAE, or outcomes in its place."""
+    if config.skills.model == "outcome":
+        return OutcomeModel(env.observation_size, env.action_size, config.skills, env.body_frame)
     view = make_view(config.skills.view, env.body_frame)
     return SkillModel(env.observation_size, env.action_size, config.skills, view)
 
@@ -160,7 +163,7 @@ def _weights(config: Config, method: Method, env: SpaceSizes) -> SegmentWeights:
 
 def _information(context: BuildContext, model: SkillModel, view: Mapping[str, Any]) -> InformationTerm | None:
     skills = context.config.skills
-    if not context.method.information:
+    if not context.method.information or skills.alpha == 0.0:  # at which its gradient is nothing, and its cost is not
         return None
     if skills.mi_rollout == "logged":
         return SegmentTerm(model, LoggedStates(skills.horizon))

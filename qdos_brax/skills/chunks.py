@@ -61,6 +61,8 @@ class NoiseChunks:
         action_dim: width of actions.
     """
 
+    reach: int | None = None
+
     def __init__(self, flow: FlowPolicy, action_dim: int) -> None:
         self.width, self._flow, self._action_dim = flow.action_dim, flow, action_dim
 

@@ -26,9 +26,12 @@ class LowLevelPolicy(Protocol):
 
     Attributes:
         width: of u and z.
+        reach: steps from a segment's first observation to the one that tells the posterior what came after, or None:
+            those of the segment.
     """
 
     width: int
+    reach: int | None
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
         """Return q(z | segment), [B, width] each; log_std is -inf where z is known exactly.
@@ -36,7 +39,7 @@ class LowLevelPolicy(Protocol):
         Args:
             params: of the source.
             segments: windows of the data.
-            after: [B, obs], the observation behind each window's last action.
+            after: [B, obs], the observation ``reach`` steps after each window's first, or the episode's last.
         """
         ...
 
@@ -106,6 +109,8 @@ class LatentModel(Protocol):
 class AnywhereSkills:
     """Play skills that remember nothing of where they begin."""
 
+    reach: int | None = None
+
     def begin(self, params: Any, latent: jax.Array, observation: jax.Array) -> jax.Array:
         """Return z."""
         return latent
@@ -152,7 +157,7 @@ class LatentSkills(AnywhereSkills):
 
 
 class TrajectorySkills(LatentSkills):
-    """Play the latents of the trajectory VAE: z says what a whole segment does.
+    """Play the latents of the trajectory VAE: z says what a whole segment does, or, of outcomes, what comes of it.
 
     Args:
         model: posterior, prior and decoder.
@@ -161,12 +166,12 @@ class TrajectorySkills(LatentSkills):
 
     def __init__(self, model: SkillModel, map_name: str) -> None:
         super().__init__(model, map_name)
-        self._skills = model
+        self._skills, self.reach = model, model.reach
         self.skill_size, self.context_size = model.skill_size, model.context_size
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
-        """Return the encoder's posterior."""
-        return self._skills.encode(params, segments)
+        """Return the model's posterior."""
+        return self._skills.encode(params, segments._replace(later=after))
 
     def begin(self, params: Any, latent: jax.Array, observation: jax.Array) -> jax.Array:
         """Return z and the pose in which it begins."""
@@ -205,7 +210,7 @@ class TransitionSkills(LatentSkills):
 
     def posterior(self, params: Any, segments: Segments, after: jax.Array) -> Posterior:
         """Return the posterior of the mean of the transitions' independent latents."""
-        mean, log_std = self._encode(params, *segments)
+        mean, log_std = self._encode(params, segments.observations, segments.actions)
         variance = jnp.mean(jnp.exp(2 * log_std), axis=1) / log_std.shape[1]
         return Posterior(jnp.mean(mean, axis=1), 0.5 * jnp.log(variance))
 

@@ -122,7 +122,7 @@ class OutcomeTerm:
         filled = jnp.minimum(state.batches, _BATCHES) * self._batch
         index = jax.random.randint(skill_key, (_ROWS,), 0, filled)
         some = jax.tree.map(lambda leaf: leaf[index], state.memory)
-        seen = self._model.see_along(params, segments.observations)
+        seen = self._model.see_along(params, segments.observations[:_ROWS])
         valid = some.weight > 0  # not of a simulation that broke
         played, played_from = _steps(step_key, some.seen, some.actions)
         logged, _ = _steps(data_key, seen, segments.actions)

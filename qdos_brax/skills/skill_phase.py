@@ -15,7 +15,6 @@ from flax import struct
 
 from qdos_brax.config import Config, SkillsConfig, asks_auto
 from qdos_brax.data.device import DeviceData
-from qdos_brax.data.segments import window
 from qdos_brax.nn.optim import ADAM, adam_step, rate_schedule
 from qdos_brax.population import health
 from qdos_brax.population.members import Population
@@ -25,7 +24,7 @@ from qdos_brax.skills.information_terms import InformationTerm, Rollout
 from qdos_brax.skills.latent_map import Prior, latent_map
 from qdos_brax.skills.segment_weights import SegmentBatch, SegmentWeights
 from qdos_brax.skills.temperature import effective_share, member_temperature
-from qdos_brax.skills.vae import Segments, SkillModel
+from qdos_brax.skills.vae import Segments, SkillModel, segments_at
 from qdos_brax.skills.weights import advantage_weights
 
 _UPDATES_PER_CHUNK = 1_000  # at most, where a block is not longer: a run looks for signals between chunks
@@ -233,7 +232,7 @@ class SkillPhase(MemberPhase):
         return state.replace(information=information), info
 
     def _segments(self, data: DeviceData, index: jax.Array) -> Segments:
-        return Segments(*window((data.observations, data.actions), data.starts[index], self._skills.horizon))
+        return segments_at(data, data.starts[index], self._skills.horizon, self._model.reach)
 
     def _batch(self, state: SkillPhaseState, data: DeviceData, index: jax.Array) -> SegmentBatch:
         observation = data.observations[data.starts[index]]

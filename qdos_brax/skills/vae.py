@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from qdos_brax.config import SkillsConfig
+from qdos_brax.data.device import DeviceData
+from qdos_brax.data.segments import rows_ahead, window
 from qdos_brax.nn.networks import MLP, DiagonalGaussian, SegmentEncoder, gaussian_kl, gaussian_log_prob, gaussian_sample
 from qdos_brax.skills.views import View, WorldView
 
@@ -17,10 +19,24 @@ Params = Any
 
 
 class Segments(NamedTuple):
-    """Hold windows of the data: observations[B, H, obs] (normalised), actions[B, H, act]."""
+    """Hold windows of the data.
+
+    Attributes:
+        observations: [B, H, obs], normalised.
+        actions: [B, H, act].
+        later: [B, obs], the observation ``SkillModel.reach`` steps after the first, or the episode's last; None for
+            models that do not ask for it.
+    """
 
     observations: jax.Array
     actions: jax.Array
+    later: jax.Array | None = None
+
+
+def segments_at(data: DeviceData, starts: jax.Array, horizon: int, reach: int | None) -> Segments:
+    """Return the segments of ``horizon`` rows at ``starts[B]``, with what follows ``reach`` steps after their first."""
+    later = None if reach is None else data.next_observations[rows_ahead(starts, data.last, reach)]
+    return Segments(*window((data.observations, data.actions), starts, horizon), later)
 
 
 class Posterior(NamedTuple):
@@ -46,7 +62,10 @@ class SkillModel:
         view: as given.
         skill_size: width of a skill that has begun: z and a pose.
         context_size: width of what the decoder is shown.
+        reach: steps from a segment's first observation to ``Segments.later``, or None if that is not asked for.
     """
+
+    reach: int | None = None
 
     def __init__(self, observation_dim: int, action_dim: int, config: SkillsConfig, view: View | None = None) -> None:
         self.latent_dim, self.view = config.latent_dim, view or WorldView()
@@ -91,11 +110,15 @@ class SkillModel:
     def context(self, params: dict[str, Params], observation: jax.Array, skill: jax.Array) -> jax.Array:
         """Return what the decoder is shown, [..., seen + z]: the view of an observation, and the latent."""
         latent, pose = skill[..., : self.latent_dim], skill[..., self.latent_dim :]
-        return _context(self._see(params, observation, pose), latent)
+        return self.shown(self._see(params, observation, pose), latent)
+
+    def shown(self, seen: jax.Array, latent: jax.Array) -> jax.Array:
+        """Return what the decoder is shown, [..., seen + z], of what the view shows and z."""
+        return jnp.concatenate([seen, latent], axis=-1)
 
     def decode_seen(self, params: dict[str, Params], seen: jax.Array, latent: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return pi(a | s, z) of what the view shows of s, ``seen[..., seen]``, and z[..., latent]."""
-        return self._decoder.apply(params["decoder"], _context(seen, latent))
+        return self._decoder.apply(params["decoder"], self.shown(seen, latent))
 
     def see_along(self, params: dict[str, Params], observations: jax.Array) -> jax.Array:
         """Return what the view shows of observations[B, H, obs] in a skill begun at the first of them, [B, H, seen]."""
@@ -181,8 +204,3 @@ class SkillModel:
 
     def _see(self, params: dict[str, Params], observation: jax.Array, pose: jax.Array) -> jax.Array:
         return self.view.see(params.get("view", {}), observation, pose)
-
-
-def _context(seen: jax.Array, latent: jax.Array) -> jax.Array:
-    """Return what the decoder is shown, [..., seen + z], of what the view shows and z."""
-    return jnp.concatenate([seen, latent], axis=-1)

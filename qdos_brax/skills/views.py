@@ -96,12 +96,12 @@ class StartView:
 
     def pose(self, params: Any, observation: jax.Array) -> jax.Array:
         """Return the frame's pose."""
-        return self._frame.pose(_raw(params, observation))
+        return self._frame.pose(in_own_units(params, observation))
 
     def see(self, params: Any, observation: jax.Array, pose: jax.Array) -> jax.Array:
         """Return the observation in the frame of the pose, normalised."""
         normalise = Normaliser(**jax.lax.stop_gradient(params["seen"]))
-        return normalise(self._frame.see(_raw(params, observation), pose))
+        return normalise(self._frame.see(in_own_units(params, observation), pose))
 
 
 class BodyView(StartView):
@@ -120,8 +120,8 @@ class BodyView(StartView):
         return super().see(params, observation, super().pose(params, observation))
 
 
-def _raw(params: Any, observation: jax.Array) -> jax.Array:
-    """Return a normalised observation in the task's own units."""
+def in_own_units(params: Any, observation: jax.Array) -> jax.Array:
+    """Return a normalised observation in the task's own units, by what a view knows of the data."""
     world = jax.lax.stop_gradient(params["world"])
     return observation * world["scale"] + world["mean"]
 
