@@ -171,5 +171,5 @@ def _information(context: BuildContext, model: SkillModel, view: Mapping[str, An
     if skills.mi_encoder == "segment":
         return SegmentTerm(model, source)
     seen = seen_paths(model, view, context.data, skills.horizon)
-    forward = ForwardModel(step_scale(seen), model.action_dim, skills.decoder_hidden)
+    forward = ForwardModel(step_scale(seen), model.action_dim, skills.prior_hidden)
     return OutcomeTerm(model, source, fit_outcomes(seen), forward, skills.prior_hidden, skills.mi_batch, skills.horizon)

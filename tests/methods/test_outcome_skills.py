@@ -1,4 +1,4 @@
-"""A run whose skills are outcomes: from data to an agent, with the information term and without it."""
+"""A run whose skills are outcomes, from data to an agent, and when its information term is computed."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from qdos_brax.methods.build import bind_phases, build_context, build_phases
 from qdos_brax.population.members import Population
 from qdos_brax.runs.folder import RunFolder
 from qdos_brax.runs.loop import run_phases
+from qdos_brax.skills.skill_phase import SkillPhase
 from tests.point import PointEnv, point_config, point_dataset
 
 OUTCOMES = {
@@ -38,8 +39,8 @@ class Plane(PointEnv):
     body_frame = BodyFrame()
 
 
-def learned(config: configs.Config, folder: Path) -> tuple[Any, set[str]]:
-    """Return the agent of a run, and the columns of what its skills reported."""
+def learned(config: configs.Config, folder: Path) -> Any:
+    """Return the agent of a run."""
     context = build_context(config, Plane(), point_dataset(100))
     phases, members = build_phases(context), configs.members(config)
     bind_phases(phases, Population(configs.population_hyper(config)), context.data)
@@ -47,23 +48,29 @@ def learned(config: configs.Config, folder: Path) -> tuple[Any, set[str]]:
     with run.held():
         _, artifacts = run_phases(phases, run, members, config=configs.config_hash(config), header={})
     trained = trained_run(config, Plane(), artifacts)
-    rows = run.metrics.read_text(encoding="utf-8").splitlines()
-    return trained.agent(*jax.tree.map(lambda leaf: leaf[0], (trained.artifacts, trained.hyper))), set(
-        rows[0].split(",")
-    )
+    return trained.agent(*jax.tree.map(lambda leaf: leaf[0], (trained.artifacts, trained.hyper)))
 
 
-@pytest.mark.parametrize("alpha", [0.0, 0.3])
-def test_what_is_asked_for_happens(alpha: float, tmp_path: Path) -> None:
+def test_what_is_asked_for_happens(tmp_path: Path) -> None:
     """A step takes it 0.09 m on, so that a way of 0.45 m takes the five steps that a skill looks ahead."""
-    agent, columns = learned(point_config(**OUTCOMES, **{"skills.alpha": alpha}), tmp_path / "run")
-    assert ("information_loss" in columns) == (alpha > 0)  # at 0 it is not computed
+    agent = learned(point_config(**OUTCOMES, **{"skills.alpha": 0.3}), tmp_path / "run")
     env = Plane()
+    start = env.reset_to(jnp.array([0.2, -0.1]), jnp.zeros(2))
+
+    @jax.jit
+    def played(way: jax.Array) -> jax.Array:
+        skill = agent.begin(start.obs, way)
+        step = lambda state, index: (env.step(state, agent.play(state.obs, skill, index)), None)  # noqa: E731
+        return jax.lax.scan(step, start, jnp.arange(5))[0].obs - start.obs
+
     for angle in np.arange(8) * np.pi / 4:
         way = 0.45 * jnp.array([np.cos(angle), np.sin(angle)])
-        state = env.reset_to(jnp.array([0.2, -0.1]), jnp.zeros(2))
-        start = state.obs
-        skill = agent.begin(state.obs, way)
-        for step in range(5):
-            state = env.step(state, agent.play(state.obs, skill, step))
-        np.testing.assert_allclose(state.obs - start, way, atol=0.12)
+        np.testing.assert_allclose(played(way), way, atol=0.12)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("alpha", "computed"), [(0.0, False), (0.3, True), ((0.0, 0.3), True)])
+def test_the_information_term_is_computed_only_where_it_counts(alpha: Any, computed: bool) -> None:
+    context = build_context(point_config(**OUTCOMES, **{"skills.alpha": alpha}), Plane(), point_dataset(4))
+    (phase,) = [phase for phase in build_phases(context) if isinstance(phase, SkillPhase)]
+    assert (phase._information is not None) == computed
