@@ -103,7 +103,7 @@ class SkillsConfig:
         "vae",
         "outcome",
     )
-    outcome_steps: int = count(40, "(model outcome) steps ahead of which a skill says what happens; H or more")
+    outcome_steps: int = count(40, "(model outcome) steps ahead of which a skill says what happens")
     latent_dim: int = count(8, "size of the skill z")
     view: str = choice(
         "world",

@@ -184,7 +184,7 @@ def test_the_decoder_makes_happen_what_it_is_told_and_the_prior_knows_how_far_th
     [
         (["skills.view=start"], "skills.model=outcome needs skills.view=body, not start"),
         (["skills.mi_encoder=segment"], "skills.model=outcome needs skills.mi_encoder=outcome"),
-        (["skills.outcome_steps=5"], r"skills.outcome_steps \(5\) must not be less than skills.horizon \(10\)"),
+        (["skills.mi_rollout=logged", "skills.alpha=0.3"], "skills.mi_encoder=outcome needs skills.mi_rollout=physics"),
     ],
 )
 def test_settings_that_do_not_go_with_outcomes_are_named(settings: list[str], message: str) -> None:
