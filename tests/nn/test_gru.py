@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qdos_brax.nn.gru import BidirectionalGRU
+from qdos_brax.nn.gru import BidirectionalGRU, orthogonal
 
 HIDDEN, WIDTH = 4, 3
 
@@ -69,3 +69,14 @@ def test_members_learn_as_they_do_alone(layer_and_input):
     for index, alone in enumerate((params, other)):
         for a, b in zip(jax.tree.leaves(both), jax.tree.leaves(gradient(alone, x)), strict=True):
             np.testing.assert_allclose(a[index], b, rtol=1e-4, atol=1e-4)
+
+
+def test_members_matrices_are_drawn_one_by_one_and_are_flaxs() -> None:
+    """A batch of factorisations beside another one can wait for it for ever; numbers are those of the batch."""
+    keys = jax.random.split(jax.random.key(0), 3)
+    ours = jax.jit(jax.vmap(lambda key: orthogonal(key, (4, 12))))
+    theirs = jax.vmap(lambda key: nn.initializers.orthogonal()(key, (4, 12)))
+    np.testing.assert_allclose(ours(keys), theirs(keys), atol=1e-6)
+    np.testing.assert_allclose(ours(keys)[1] @ ours(keys)[1].T, np.eye(4), atol=1e-5)
+    assert "f32[3,12,4]" in str(jax.make_jaxpr(theirs)(keys))
+    assert "f32[3,12,4]" not in str(jax.make_jaxpr(ours)(keys))
