@@ -119,30 +119,13 @@ class OutcomeModel(SkillModel):
         ahead = self._frame.turned_ways(latent, pose) / _USUAL_WAY
         return jnp.concatenate([seen[..., : -self._frame.pose_size], ahead], axis=-1)
 
-    def vae_loss(
-        self,
-        params: dict[str, Params],
-        segments: Segments,
-        weight: jax.Array,
-        kl_weight: jax.Array | float,
-        key: jax.Array,
-        kl_weighted: bool,
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Return mean_i [ w_i or 1 ] beta (-log p(z_i | s_i)) - w_i log pi(a_i | s_i, z_i), of each segment's first
-        step, with z_i its outcome: the loss of the trajectory VAE but for the entropy of a posterior that is a point.
+    def divergence_and_likelihood(
+        self, params: dict[str, Params], segments: Segments, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return -log p(z | s) and log pi(a | s, z) of each segment's first step, z its outcome, [B] each.
 
-        Args:
-            params: the model's parameters.
-            segments: windows, leading axis B, with ``later``.
-            weight: [B], mean about 1.
-            kl_weight: beta.
-            key: unused; nothing is sampled.
-            kl_weighted: weight the prior's part too.
+        A posterior that is a point has no entropy to count, and nothing is sampled.
         """
         first, outcome = segments.observations[:, 0], self.encode(params, segments).mean
         log_likelihood = gaussian_log_prob(segments.actions[:, 0], *self.decode(params, first, outcome))
-        surprise = -gaussian_log_prob(outcome, *self.prior(params, first))
-        share = weight * surprise if kl_weighted else surprise
-        loss = jnp.mean(kl_weight * share - weight * log_likelihood)
-        info = {"vae_loss": loss, "kl": jnp.mean(surprise), "log_likelihood": jnp.mean(log_likelihood)}
-        return loss, info
+        return -gaussian_log_prob(outcome, *self.prior(params, first)), log_likelihood

@@ -178,13 +178,19 @@ class SkillModel:
             key: for the posterior sample.
             kl_weighted: weight the KL as Algorithm 1 does (True) or not, as equation 4 does (False).
         """
-        posterior = self.encode(params, segments)
-        latent = gaussian_sample(key, *posterior)
-        log_likelihood = self.reconstruction(params, segments, latent)
-        kl = gaussian_kl(*posterior, *self.prior(params, segments.observations[:, 0]))
+        kl, log_likelihood = self.divergence_and_likelihood(params, segments, key)
         kl_share = weight * kl if kl_weighted else kl
         loss = jnp.mean(kl_weight * kl_share - weight * log_likelihood)
         return loss, {"vae_loss": loss, "kl": jnp.mean(kl), "log_likelihood": jnp.mean(log_likelihood)}
+
+    def divergence_and_likelihood(
+        self, params: dict[str, Params], segments: Segments, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return KL(q || p) and the log-likelihood of the actions under a sample of q, [B] each."""
+        posterior = self.encode(params, segments)
+        latent = gaussian_sample(key, *posterior)
+        log_likelihood = self.reconstruction(params, segments, latent)
+        return gaussian_kl(*posterior, *self.prior(params, segments.observations[:, 0])), log_likelihood
 
     def information_loss(
         self, params: dict[str, Params], observations: jax.Array, latent: jax.Array, weight: jax.Array
