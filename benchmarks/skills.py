@@ -8,7 +8,7 @@ Plays draws from the skill prior in the simulator, of every member of a finished
   from the observation alone, and from that and the latent: each second beyond its first is what z says of what happens;
 - the share of states in which skills have to get at something and do: in mazes states at a wall, less than WALL away,
   from which WAY_SECONDS of skills lead more than AWAY away, each the draw that leads furthest; for an arm all states,
-  where a draw moves a thing by MOVED;
+  where a draw moves a thing by MOVED; beside it ("_log") the share of the same states from which the log itself did;
 - random skills, one after the other: success and best score of whole episodes;
 - the oracle: success, score and steps of episodes in which the draw of most progress is played, by the truth and by
   what training knows (V, the cost to go of the nearest logged states on the graph that weighs segments too);
@@ -95,8 +95,7 @@ class Skills:
 def from_logged_states(skills: Skills, truth: Truth, dataset: Dataset, states: int) -> dict[str, float]:
     """Return the measures that need no episodes."""
     rows = np.random.default_rng(0).choice(len(dataset.qpos), states, replace=False)
-    extra = np.zeros((states, skills.env.extra_size), np.int32) if dataset.extra is None else dataset.extra[rows]
-    before = skills.reset_to(dataset.qpos[rows], dataset.qvel[rows], extra)
+    before = skills.reset_to(dataset.qpos[rows], dataset.qvel[rows], extra_of(skills.env, dataset, rows))
     found = skills.play(before, jax.random.key(1))
     gain = truth.left(before) - truth.left(found["end"])
     outcome = truth.outcome(before, found["end"])
@@ -115,7 +114,13 @@ def from_logged_states(skills: Skills, truth: Truth, dataset: Dataset, states: i
         "r2_outcome_of_state": r2(happened, seen),
         "r2_outcome_of_state_and_latent": r2(happened, seen, z, played),
         truth.reach_name: share_reached(skills, truth, before, found),
+        f"{truth.reach_name}_log": share_reached_by_log(skills, truth, dataset, before, rows),
     }
+
+
+def extra_of(env: Any, dataset: Dataset, rows: np.ndarray) -> np.ndarray:
+    """Return what a state of each row has besides positions and velocities, int32[S, extra]."""
+    return np.zeros((len(rows), env.extra_size), np.int32) if dataset.extra is None else dataset.extra[rows]
 
 
 def ends_of(found: Any, draw: np.ndarray) -> State:
@@ -137,6 +142,20 @@ def share_reached(skills: Skills, truth: Truth, before: State, found: Any) -> fl
         found = skills.play(ends_of(found, furthest), jax.random.key(1 + turn))
         reached |= truth.reach(before, found["end"]).any(axis=0)
     return float(reached.mean())
+
+
+def share_reached_by_log(skills: Skills, truth: Truth, dataset: Dataset, before: State, rows: np.ndarray) -> float:
+    """Return the share of states, of those where it counts, from which the log got at it in as many steps.
+
+    Args:
+        before: the states.
+        rows: int[S], their rows; an episode that ends sooner counts with its last.
+    """
+    bounds = dataset.episode_bounds
+    last = bounds[np.searchsorted(bounds[:, 1], rows, side="right"), 1] - 1
+    later = np.minimum(rows + max(truth.reach_steps, skills.horizon), last)
+    after = skills.reset_to(dataset.qpos[later], dataset.qvel[later], extra_of(skills.env, dataset, later))
+    return float(truth.reach(before, jax.tree.map(lambda leaf: leaf[None], after)).mean())
 
 
 class Episodes(NamedTuple):
