@@ -70,6 +70,13 @@ def main_parser(argv: Sequence[str], prog: str = _PROGRAM) -> Parser:
     report.add_argument(
         "--published", action="store_true", help="also show what others published for the tasks, in their own settings"
     )
+    report.add_argument(
+        "--pool",
+        metavar="KEY",
+        action="append",
+        default=[],
+        help="count members that differ in KEY, such as data.seed, as seeds of one setting; may be repeated",
+    )
     report.set_defaults(run=_report)
 
     picture = commands.add_parser("picture", help="draw a task at its start, or an episode and the latents of a run")
@@ -130,7 +137,7 @@ def _report(args: argparse.Namespace) -> int:
 
     runs = [Path(run) for run in args.runs]
     out = Path(args.out) if args.out else runs[0] if len(runs) == 1 else Path("report")
-    report = write_report(runs, out, args.reference, args.published)
+    report = write_report(runs, out, args.reference, args.published, args.pool)
     print(f"{report.text}\n")
     for file in report.files:
         print(file)

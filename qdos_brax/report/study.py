@@ -125,30 +125,34 @@ class Study:
     published: list[Published] = dataclasses.field(default_factory=list)
 
 
-def read_study(paths: Sequence[Path], reference: str | None = None) -> Study:
+def read_study(paths: Sequence[Path], reference: str | None = None, pooled: Sequence[str] = ()) -> Study:
     """Read runs and comparisons.
 
     Args:
         paths: folders of either kind.
         reference: the method or label to compare with; None for supe if it was run, or the first.
+        pooled: keys that do not make a setting here: members that differ in them alone count as further seeds.
 
     Raises:
         UserError: a folder is not a run, has not finished or is empty; two members are the same; there is no such
-            reference.
+            reference, or no such key.
     """
+    for key in pooled:
+        if key not in (known := [key for key, _ in leaves(Config) if key not in _NOT_A_SETTING]):
+            raise UserError(f"--pool {key}: no such key of the configuration{nearest(key, known)}")
     folders = [folder for path in paths for folder in _folders(path)]
     counts = Counter(folder.path.resolve() for folder in folders)
     for path, count in counts.items():
         if count > 1:
             raise UserError(f"{path} was given twice; give each run once")
     runs = [_read_run(folder) for folder in folders]
-    settings = _settings([member for run in runs for member in run.members])
+    settings = _settings([member for run in runs for member in run.members], pooled)
     return Study(
         runs=runs,
         tasks=sorted({member.task for run in runs for member in run.members}),
         settings=settings,
         reference=_reference(settings, reference),
-        notes=list(_notes(settings)),
+        notes=list(_notes(settings, pooled)),
     )
 
 
@@ -227,18 +231,20 @@ def _provenance(folder: RunFolder) -> dict[str, Any]:
 # --- Settings --------------------------------------------------------------------------------------------------
 
 
-def _settings(members: Sequence[Member]) -> list[Setting]:
-    """Group members with the same method and equal values, whatever their run folders."""
-    varied = {method: varied_keys(members, method) for method in dict.fromkeys(member.method for member in members)}
+def _settings(members: Sequence[Member], pooled: Sequence[str]) -> list[Setting]:
+    """Group members with the same method and equal values, but for those pooled, whatever their run folders."""
+    methods = dict.fromkeys(member.method for member in members)
+    varied = {method: [key for key in varied_keys(members, method) if key not in pooled] for method in methods}
     settings: dict[tuple[str, ...], Setting] = {}
     for member in members:
         values = {key: member.values[key] for key in varied[member.method]}
         named = _named(member, values, members)
-        label = ", ".join([member.method, *(f"{short_key(key)} {format_value(value)}" for key, value in named.items())])
+        words = [f"{short_key(key, named)} {format_value(value)}" for key, value in named.items()]
+        label = ", ".join([member.method, *words])
         setting = settings.setdefault((label, *map(str, values.values())), Setting(label, member.method, values, {}))
         others = setting.members.setdefault(member.task, [])
         for other in others:
-            if other.seed == member.seed:
+            if other.seed == member.seed and all(other.values[key] == member.values[key] for key in pooled):
                 where = f"{label}, seed {member.seed} on {member.task}"
                 raise UserError(f"{other.run} and {member.run} both hold {where}; leave one out")
         others.append(member)
@@ -268,9 +274,17 @@ def varied_keys(members: Sequence[Member], method: str) -> list[str]:
     return list(keys)
 
 
-def short_key(key: str) -> str:
-    """Return the last part of a dotted key in words, such as "advantage temperature"."""
-    return key.rpartition(".")[2].replace("_", " ")
+def short_key(key: str, others: Iterable[str] = ()) -> str:
+    """Return the last part of a dotted key in words, such as "advantage temperature".
+
+    Args:
+        key: the key.
+        others: keys named beside it. Where one of them ends alike, and where a member's own seed does, all of it is
+            returned, such as "data seed".
+    """
+    last = key.rpartition(".")[2]
+    alike = [other for other in ("seed", *others) if other != key and other.rpartition(".")[2] == last]
+    return (key if alike else last).replace(".", " ").replace("_", " ")
 
 
 def _reference(settings: Sequence[Setting], name: str | None) -> Setting:
@@ -285,11 +299,12 @@ def _reference(settings: Sequence[Setting], name: str | None) -> Setting:
     )
 
 
-def _notes(settings: Sequence[Setting]) -> Iterable[str]:
+def _notes(settings: Sequence[Setting], pooled: Sequence[str]) -> Iterable[str]:
     """Yield a warning for unequal budgets, data and numbers of seeds, and for frozen and never evaluated members."""
     everyone = [member for setting in settings for members in setting.members.values() for member in members]
+    pools_data = any(key.startswith("data.") for key in pooled)
     for task in sorted({member.task for member in everyone}):
-        for key in _BUDGET:
+        for key in (key for key in _BUDGET if not (key == DATA and pools_data)):
             found = _methods_by_value([member for member in everyone if member.task == task], key)
             if len(found) > 1:
                 parts = "; ".join(f"{value}: {', '.join(methods)}" for value, methods in found.items())

@@ -34,7 +34,13 @@ class Report:
     files: list[Path]
 
 
-def write_report(runs: Sequence[Path], out: Path, reference: str | None = None, published: bool = False) -> Report:
+def write_report(
+    runs: Sequence[Path],
+    out: Path,
+    reference: str | None = None,
+    published: bool = False,
+    pooled: Sequence[str] = (),
+) -> Report:
     """Write page, tables (CSV and Markdown) and figures of runs and comparisons.
 
     Args:
@@ -42,11 +48,12 @@ def write_report(runs: Sequence[Path], out: Path, reference: str | None = None, 
         out: the folder for the files, created if it does not exist; files of an earlier report are replaced.
         reference: the method or label that the others are compared with; None for supe if it was run, or the first.
         published: whether to show what others published for the tasks, marked as of settings of their own.
+        pooled: keys in which seeds of one setting may differ, such as data.seed.
 
     Raises:
         UserError: a folder is no finished run, or something cannot be written.
     """
-    study = read_study(runs, reference)
+    study = read_study(runs, reference, pooled)
     analyses, missing = read_analyses(study)
     others = published_on(study.tasks) if published else []
     study = dataclasses.replace(study, notes=[*study.notes, *missing], published=others)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from qdos_brax.commands import main as commands
+from qdos_brax.errors import UserError
 from qdos_brax.report.next_step import advise
 from qdos_brax.report.result_sections import learning_section, summary_section
 from qdos_brax.report.series import curves, mean_over_steps, scans, surfaces
@@ -43,6 +44,31 @@ def test_members_are_told_apart_by_what_was_varied(tmp_path: Path) -> None:
     assert labels(supe, other) == {"supe, estimator graph": 2, "supe, estimator iql": 1}
     data = write_run(tmp_path / "data", "supe", [0.3], data="e" * 64)
     assert labels(supe, data) == {"supe, data dddddddd": 2, "supe, data eeeeeeee": 1}
+
+
+def test_seeds_on_several_sets_of_data_are_pooled_when_asked(tmp_path: Path) -> None:
+    """One learner's seed may then be there once per set; what else was varied still makes a setting."""
+    a = write_run(tmp_path / "a", success={0.1: [0.5, 0.6], 0.3: [0.7, 0.8]})
+    b = write_run(tmp_path / "b", success={0.1: [0.1], 0.3: [0.3]}, data="e" * 64, more="data: {seed: 1}\n")
+    apart = {s.label for s in read_study([a, b]).settings}
+    assert apart == {f"qdos, data seed {data}, alpha {alpha}" for data in (0, 1) for alpha in (0.1, 0.3)}
+    study = read_study([a, b], pooled=["data.seed"])
+    means = {s.label: sum(m.success for ms in s.members.values() for m in ms) for s in study.settings}
+    assert means == pytest.approx({"qdos, alpha 0.1": 1.2, "qdos, alpha 0.3": 1.8})
+    assert study.notes == []
+    with pytest.raises(UserError, match=r"both hold qdos, alpha 0\.1, seed 0 on antmaze-medium-task1"):
+        read_study([a, write_run(tmp_path / "c", success={0.1: [0.1], 0.3: [0.3]})], pooled=["data.seed"])
+    with pytest.raises(UserError, match=r"--pool data\.sed: no such key .* did you mean 'data\.seed'\?"):
+        read_study([a, b], pooled=["data.sed"])
+
+
+def test_keys_that_end_alike_are_named_in_full(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", more="values: {updates: 5}\nguide: {updates: 6}\nlabels: {rnd_features: 8}\n")
+    b = write_run(tmp_path / "b", more="values: {updates: 6}\nguide: {updates: 7}\nlabels: {rnd_features: 9}\n")
+    assert {label.removeprefix("qdos, ") for label in labels(a, b)} == {
+        "values updates 5, rnd features 8, guide updates 6",
+        "values updates 6, rnd features 9, guide updates 7",
+    }
 
 
 def test_tasks_have_alphas_of_their_own(tmp_path: Path) -> None:
