@@ -90,6 +90,8 @@ def test_rollouts_need_the_whole_state() -> None:
         assert line.startswith(says) and "skills.mi_rollout=logged" in line
         assert unmet(data, PointEnv(), config_of("qdos", **{"skills.mi_rollout": "logged"})) == []
         assert unmet(data, PointEnv(), config_of("supe")) == []
+        assert unmet(data, PointEnv(), config_of("qdos", **{"skills.alpha": 0.0})) == []  # nothing is rolled out
+        assert len(unmet(data, PointEnv(), config_of("qdos", **{"skills.alpha": [0.0, 0.3]}))) == 1
 
 
 @pytest.mark.parametrize("estimator", ["graph", "iql"])
