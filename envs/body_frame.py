@@ -48,6 +48,7 @@ class BodyFrame:
         points: x and y of other things in the plane.
         quaternions: of other things.
         vectors: x and y parts of velocities in the world's frame.
+        levels: single numbers that no turn changes and of which it matters how they come out, such as a head's height.
     """
 
     place: int = 0
@@ -56,6 +57,7 @@ class BodyFrame:
     points: tuple[int, ...] = ()
     quaternions: tuple[int, ...] = ()
     vectors: tuple[int, ...] = ()
+    levels: tuple[int, ...] = ()
 
     pose_size: ClassVar[int] = 4
 
@@ -99,22 +101,32 @@ class BodyFrame:
     @property
     def ways_size(self) -> int:
         """Return the numbers of ``ways``."""
-        return 2 * (1 + len(self.points))
+        return self._plane + len(self.levels)
 
     def ways(self, before: jax.Array, after: jax.Array) -> jax.Array:
-        """Return float[..., 2 (1 + points)], how far body and other points got, x and y of each in the world's axes.
+        """Return float[..., 2 (1 + points) + levels], how far body and other points got, x and y of each in the world's
+        axes, and how high the levels are then.
 
         Args:
             before: [..., obs], in its own units.
             after: [..., obs], likewise.
         """
-        places = (self.place, *self.points)
-        return jnp.concatenate([_pair(after, index) - _pair(before, index) for index in places], axis=-1)
+        ways = [_pair(after, index) - _pair(before, index) for index in (self.place, *self.points)]
+        return jnp.concatenate([*ways, self.levels_of(after)], axis=-1)
 
     def turned_ways(self, ways: jax.Array, pose: jax.Array) -> jax.Array:
-        """Return ``ways[..., 2 (1 + points)]`` as seen by a body in ``pose[..., 4]``: ahead of it, and to its left."""
-        pairs = [_turned(_pair(ways, index), pose[..., 2:]) for index in range(0, self.ways_size, 2)]
-        return jnp.concatenate(pairs, axis=-1)
+        """Return ``ways[..., ways_size]`` as seen by a body in ``pose[..., 4]``: ahead of it, and to its left."""
+        pairs = [_turned(_pair(ways, index), pose[..., 2:]) for index in range(0, self._plane, 2)]
+        return jnp.concatenate([*pairs, ways[..., self._plane :]], axis=-1)
+
+    def levels_of(self, observation: jax.Array) -> jax.Array:
+        """Return float[..., levels] of ``observation[..., obs]``."""
+        return observation[..., list(self.levels)] if self.levels else observation[..., :0]
+
+    @property
+    def _plane(self) -> int:
+        """Return the numbers of the ways in the plane."""
+        return 2 * (1 + len(self.points))
 
     def _facing(self, observation: jax.Array) -> jax.Array:
         """Return (cos yaw, sin yaw)[..., 2]."""

@@ -87,7 +87,8 @@ class HumanoidMaze(BodyTask):
 
     body = HUMANOID
     # Its heading is not observed; while it walks, it faces where its centre of mass and its root move.
-    body_frame = BodyFrame(course=39, vectors=(39, 42))
+    # Whether it is up is told by its head's height.
+    body_frame = BodyFrame(course=39, vectors=(39, 42), levels=(23,))
 
     def __init__(self, spec: TaskSpec, physics: str) -> None:
         super().__init__(spec, physics)

@@ -64,9 +64,9 @@ class OutcomeView:
 class OutcomeModel(SkillModel):
     """Combine a prior over outcomes and a decoder that is told one; the posterior is the outcome itself.
 
-    z holds the ways of the body and of the task's other points in the plane, x and y of each in m, in the world's axes.
-    The decoder sees them turned the way the body faces, and as what is still to happen in K steps, however long the
-    skill has been playing.
+    z holds the ways of the body and of the task's other points in the plane, x and y of each in m, in the world's axes,
+    and behind them the levels that the body will have, such as the height of a humanoid's head. The decoder sees them
+    turned the way the body faces, and as what is still to happen in K steps, however long the skill has been playing.
 
     Args:
         observation_dim: width of observations.
@@ -98,13 +98,15 @@ class OutcomeModel(SkillModel):
         return {"prior": prior, "decoder": decoder, "view": dict(view)}
 
     def prior(self, params: dict[str, Params], observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return p(z | places), of where body and points are and how the body faces: (mean[..., z], log_std[..., z]).
+        """Return p(z | places), of where body and points are, how the body faces and how high the levels are:
+        (mean[..., z], log_std[..., z]).
 
         Speed and joints would tell where the data went on to, and leave the high level little else to choose.
         """
         pose = self.view.see(params["view"], observation, observation[..., :0])[..., -self._frame.pose_size :]
         points = [observation[..., index : index + 2] for index in self._frame.points]
-        return self._prior.apply(params["prior"], jnp.concatenate([pose, *points], axis=-1))
+        levels = self._frame.levels_of(observation)
+        return self._prior.apply(params["prior"], jnp.concatenate([pose, *points, levels], axis=-1))
 
     def encode(self, params: dict[str, Params], segments: Segments) -> Posterior:
         """Return what happens from a segment's first observation to ``segments.later``; log_std is -inf."""

@@ -86,6 +86,27 @@ def test_ways_are_counted_in_the_worlds_axes_and_seen_turned() -> None:
     assert FRAME.ways_size == 4 and BodyFrame(heading=2).ways_size == 2
 
 
+def test_a_level_is_told_as_it_will_be_and_no_turn_changes_it() -> None:
+    """The last number of the observation, 6 now and 7 then."""
+    frame = BodyFrame(heading=2, levels=(7,))
+    ways = frame.ways(observation(1, 2, 0.3, (0, 6)), observation(1, 4, 1.0, (0, 7)))
+    np.testing.assert_allclose(ways, [0, 2, 7])
+    facing_up = frame.pose(observation(0, 0, np.pi / 2, (0, 0)))
+    np.testing.assert_allclose(frame.turned_ways(ways, facing_up), [2, 0, 7], atol=1e-6)
+    assert frame.ways_size == 3
+
+
+def test_the_prior_of_a_level_is_told_the_present_one_and_of_ways_nothing_of_other_numbers() -> None:
+    frame = BodyFrame(heading=2, levels=(7,))
+    model = OutcomeModel(8, 2, replace(SIZES, latent_dim=3), frame)
+    windows = segments_at(walks()[0], jnp.arange(0, 384, 6), 2, None).observations
+    params = model.init(jax.random.key(0), model.view.fit(windows, NORMALISER))
+    here = windows[:, 0]
+    same, other = here.at[:, 6].add(1.0), here.at[:, 7].add(1.0)
+    np.testing.assert_array_equal(model.prior(params, here)[0], model.prior(params, same)[0])
+    assert np.all(np.abs(model.prior(params, here)[0] - model.prior(params, other)[0]).max(axis=-1) > 1e-4)
+
+
 def test_the_row_ahead_never_leaves_the_episode() -> None:
     last = jnp.array([3, 3, 3, 3, 9, 9, 9, 9, 9, 9])
     np.testing.assert_array_equal(rows_ahead(jnp.array([0, 2, 3, 4, 7]), last, 4), [3, 3, 3, 7, 9])
