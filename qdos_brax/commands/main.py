@@ -75,7 +75,7 @@ def main_parser(argv: Sequence[str], prog: str = _PROGRAM) -> Parser:
         metavar="KEY",
         action="append",
         default=[],
-        help="count members that differ in KEY, such as data.seed, as seeds of one setting; may be repeated",
+        help="count members that differ in KEY (data.seed; data: the file) as seeds of one setting; may be repeated",
     )
     report.set_defaults(run=_report)
 

@@ -131,15 +131,17 @@ def read_study(paths: Sequence[Path], reference: str | None = None, pooled: Sequ
     Args:
         paths: folders of either kind.
         reference: the method or label to compare with; None for supe if it was run, or the first.
-        pooled: keys that do not make a setting here: members that differ in them alone count as further seeds.
+        pooled: keys that do not make a setting here, ``DATA`` among them: members that differ in them alone count as
+            further seeds.
 
     Raises:
         UserError: a folder is not a run, has not finished or is empty; two members are the same; there is no such
             reference, or no such key.
     """
+    poolable = [DATA, *(key for key, _ in leaves(Config) if key not in _NOT_A_SETTING)]
     for key in pooled:
-        if key not in (known := [key for key, _ in leaves(Config) if key not in _NOT_A_SETTING]):
-            raise UserError(f"--pool {key}: no such key of the configuration{nearest(key, known)}")
+        if key not in poolable:
+            raise UserError(f"--pool {key}: no key by which settings are told apart{nearest(key, poolable)}")
     folders = [folder for path in paths for folder in _folders(path)]
     counts = Counter(folder.path.resolve() for folder in folders)
     for path, count in counts.items():
@@ -302,7 +304,7 @@ def _reference(settings: Sequence[Setting], name: str | None) -> Setting:
 def _notes(settings: Sequence[Setting], pooled: Sequence[str]) -> Iterable[str]:
     """Yield a warning for unequal budgets, data and numbers of seeds, and for frozen and never evaluated members."""
     everyone = [member for setting in settings for members in setting.members.values() for member in members]
-    pools_data = any(key.startswith("data.") for key in pooled)
+    pools_data = any(key.partition(".")[0] == DATA for key in pooled)
     for task in sorted({member.task for member in everyone}):
         for key in (key for key in _BUDGET if not (key == DATA and pools_data)):
             found = _methods_by_value([member for member in everyone if member.task == task], key)

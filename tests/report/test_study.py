@@ -58,8 +58,10 @@ def test_seeds_on_several_sets_of_data_are_pooled_when_asked(tmp_path: Path) -> 
     assert study.notes == []
     with pytest.raises(UserError, match=r"both hold qdos, alpha 0\.1, seed 0 on antmaze-medium-task1"):
         read_study([a, write_run(tmp_path / "c", success={0.1: [0.1], 0.3: [0.3]})], pooled=["data.seed"])
-    with pytest.raises(UserError, match=r"--pool data\.sed: no such key .* did you mean 'data\.seed'\?"):
+    with pytest.raises(UserError, match=r"--pool data\.sed: no key by which settings .* did you mean 'data\.seed'\?"):
         read_study([a, b], pooled=["data.sed"])
+    other = write_run(tmp_path / "d", success={0.1: [0.1], 0.3: [0.3]}, data="f" * 64)  # a file of one's own
+    assert [s.label for s in read_study([a, other], pooled=["data"]).settings] == ["qdos, alpha 0.1", "qdos, alpha 0.3"]
 
 
 def test_keys_that_end_alike_are_named_in_full(tmp_path: Path) -> None:
