@@ -43,6 +43,7 @@ from qdos_brax.analysis.conclusion import read_finished
 from qdos_brax.analysis.film import of_member, on_mujoco_c
 from qdos_brax.analysis.finished import TrainedRun
 from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.segments import episode_last
 from qdos_brax.errors import guarded
 from qdos_brax.methods.learners_view import run_dataset
 from qdos_brax.runs.folder import RunFolder
@@ -151,9 +152,7 @@ def share_reached_by_log(skills: Skills, truth: Truth, dataset: Dataset, before:
         before: the states.
         rows: int[S], their rows; an episode that ends sooner counts with its last.
     """
-    bounds = dataset.episode_bounds
-    last = bounds[np.searchsorted(bounds[:, 1], rows, side="right"), 1] - 1
-    later = np.minimum(rows + max(truth.reach_steps, skills.horizon), last)
+    later = np.minimum(rows + max(truth.reach_steps, skills.horizon), episode_last(dataset.ends)[rows])
     after = skills.reset_to(dataset.qpos[later], dataset.qvel[later], extra_of(skills.env, dataset, later))
     return float(truth.reach(before, jax.tree.map(lambda leaf: leaf[None], after)).mean())
 

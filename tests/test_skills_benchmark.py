@@ -83,8 +83,8 @@ def test_what_happens_is_told_by_the_latent_only_where_it_is_heard() -> None:
     """Var(z s) is 1 beside the state's own 1 (s of either sign, unit size): half of what happens is the state's."""
     rng = np.random.default_rng(0)
     place = np.stack([rng.choice([-1.0, 1.0], 400), rng.normal(size=400)], axis=-1)
-    bounds = np.array([[0, 400]])
-    dataset = SimpleNamespace(qpos=place, qvel=place, observations=place, extra=None, episode_bounds=bounds)
+    ends = np.arange(400) == 399
+    dataset = SimpleNamespace(qpos=place, qvel=place, observations=place, extra=None, ends=ends)
     heard, deaf = (skills.from_logged_states(Linear(size), Moved(), dataset, 400) for size in (1.0, 0.0))
     np.testing.assert_allclose(heard["r2_outcome_of_state"], 0.5, atol=0.06)
     np.testing.assert_allclose(heard["r2_outcome_of_state_and_latent"], 1.0, atol=1e-3)
@@ -95,8 +95,8 @@ def test_what_happens_is_told_by_the_latent_only_where_it_is_heard() -> None:
 def test_the_log_is_asked_from_the_same_states_and_to_its_episodes_end() -> None:
     """Two episodes: one that has moved by its third row, one that has not; two steps ahead, the horizon."""
     place = np.array([[1.0, y] for y in (0, 0, 5, 0, 0, 0, 0, 5)])
-    bounds = np.array([[0, 5], [5, 8]])
-    dataset = SimpleNamespace(qpos=place, qvel=place, extra=None, episode_bounds=bounds)
+    ends = np.isin(np.arange(8), (4, 7))
+    dataset = SimpleNamespace(qpos=place, qvel=place, extra=None, ends=ends)
     for rows, share in (([0, 5, 6, 7], 1.0), ([1, 2, 3, 4], 0.0), ([0, 3, 4, 1], 0.25)):
         before = state(place[rows])
         assert skills.share_reached_by_log(Linear(1.0), Moved(), dataset, before, np.array(rows)) == share

@@ -263,15 +263,15 @@ def _check_together(config: Config) -> None:
             "skills.alpha=auto with skills.mi_encoder=segment needs skills.mi_latent=box: it asks how much of a latent "
             "of known spread can be read back"
         )
-    rolls_out = config.skills.alpha != 0.0  # without the term, nothing does
-    if rolls_out and config.skills.mi_encoder == "outcome" and config.skills.mi_rollout != "physics":
+    skills = config.skills
+    if skills.has_information and skills.mi_encoder == "outcome" and skills.mi_rollout != "physics":
         raise UserError(
             "skills.mi_encoder=outcome needs skills.mi_rollout=physics: logged states are no outcome of z; without "
             "simulator states leave the term out with --alpha 0"
         )
-    if config.skills.model == "outcome":
-        _check_outcomes(config.skills)
-    elif config.skills.mi_encoder == "outcome" and config.skills.view == "body":
+    if skills.model == "outcome":
+        _check_outcomes(skills)
+    elif skills.mi_encoder == "outcome" and skills.view == "body":
         raise UserError(
             "skills.mi_encoder=outcome needs skills.view=start or world: the body's present frame hides where it got"
         )

@@ -189,3 +189,8 @@ class SkillsConfig:
     mi_batch: int = count(64, "rollouts per batch")
     latent_box: Scannable = number(2.0, "half the side of the box that random skills are drawn from", above=True)
     updates: int = count(500_000, "gradient steps", pretrain=True)
+
+    @property
+    def has_information(self) -> bool:
+        """Return whether some member has the mutual-information term: at alpha 0 it has a cost and no gradient."""
+        return self.alpha != 0.0

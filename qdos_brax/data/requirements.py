@@ -77,7 +77,8 @@ def _segments(data: Rows | Dataset, config: Config) -> list[str]:
 
 def _states(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
     """Return a line if rollouts in the simulator have no states to start from."""
-    if not METHODS[config.method].information or config.skills.mi_rollout != "physics" or config.skills.alpha == 0.0:
+    skills = config.skills
+    if not (METHODS[config.method].information and skills.has_information and skills.mi_rollout == "physics"):
         return []
     missing = _missing_states(data, env)
     if not missing:

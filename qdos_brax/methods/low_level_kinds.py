@@ -163,7 +163,7 @@ def _weights(config: Config, method: Method, env: SpaceSizes) -> SegmentWeights:
 
 def _information(context: BuildContext, model: SkillModel, view: Mapping[str, Any]) -> InformationTerm | None:
     skills = context.config.skills
-    if not context.method.information or skills.alpha == 0.0:  # at which its gradient is nothing, and its cost is not
+    if not (context.method.information and skills.has_information):
         return None
     if skills.mi_rollout == "logged":
         return SegmentTerm(model, LoggedStates(skills.horizon))

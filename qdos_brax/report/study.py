@@ -34,6 +34,7 @@ _NOT_A_SETTING = {
     "scan.draw_seed",
     "members_per_program",
 }
+_SETTING_KEYS = [key for key, _ in leaves(Config) if key not in _NOT_A_SETTING]  # those that do, besides DATA
 # What methods that are compared on one task should have in common.
 _BUDGET = ("preset", "physics", "high_level.env_steps", "eval.episodes", DATA)
 _MOST_NAMED = 3
@@ -138,10 +139,9 @@ def read_study(paths: Sequence[Path], reference: str | None = None, pooled: Sequ
         UserError: a folder is not a run, has not finished or is empty; two members are the same; there is no such
             reference, or no such key.
     """
-    poolable = [DATA, *(key for key, _ in leaves(Config) if key not in _NOT_A_SETTING)]
     for key in pooled:
-        if key not in poolable:
-            raise UserError(f"--pool {key}: no key by which settings are told apart{nearest(key, poolable)}")
+        if key not in (DATA, *_SETTING_KEYS):
+            raise UserError(f"--pool {key}: no key by which settings are told apart{nearest(key, _SETTING_KEYS)}")
     folders = [folder for path in paths for folder in _folders(path)]
     counts = Counter(folder.path.resolve() for folder in folders)
     for path, count in counts.items():
@@ -184,7 +184,7 @@ def _read_run(folder: RunFolder) -> Run:
     if not rows:
         raise UserError(f"{folder.metrics} has no rows, so there is nothing to report; leave this run out")
     provenance = _provenance(folder)
-    values = {key: get(config, key) for key, _ in leaves(Config) if key not in _NOT_A_SETTING}
+    values = {key: get(config, key) for key in _SETTING_KEYS}
     values[DATA] = provenance.get("dataset", {}).get("sha256", "")[:8]
     by_member: dict[str, list[Row]] = {}
     for row in rows:

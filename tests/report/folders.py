@@ -78,3 +78,12 @@ def write_run(
     run = {"command": ["train.py", "--env", env], "dataset": dataset, "python": "3.11.7", "packages": {"jax": "0.10.2"}}
     (path / "run.json").write_text(json.dumps(run))
     return path
+
+
+def vary(run: Path, **values: list[float]) -> Path:
+    """Give the members of a run more hyperparameters that were varied."""
+    summary = json.loads((run / "summary.json").read_text())
+    for i, member in enumerate(summary["members"]):
+        member |= {f"skills.{key}": own[i] for key, own in values.items()}
+    (run / "summary.json").write_text(json.dumps(summary))
+    return run
