@@ -13,9 +13,6 @@ from qdos_brax.collection.experts.steering import CellSteering, Navigator, Steer
 from qdos_brax.collection.experts.turning import CurvedSteering
 from qdos_brax.errors import UserError
 
-MAZE_TURN = 1.2
-"""Largest angle between a humanoid's facing direction and its command, rad: it turns in 0.4 m, and falls more often."""
-
 
 @dataclass(frozen=True)
 class CollectionProfile:
@@ -55,7 +52,7 @@ def profile_of(env: MazeTask) -> CollectionProfile:
 ANT = CollectionProfile(policies.ant_walker, NoRecovery, CellSteering, heavy_noise=1.0, stitch_steps=200)
 
 HUMANOID = CollectionProfile(
-    partial(policies.humanoid_walker, max_turn=MAZE_TURN),
+    partial(policies.humanoid_walker, max_turn=policies.MAZE_TURN),
     humanoid_rising,
     CurvedSteering,
     heavy_noise=0.4,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 
 from envs.mazes.locomotion import dropped_humanoid, dropped_poses
 from envs.physics.base import Engine, PipelineState
-from qdos_brax.collection.experts.rising import LIES, Motions, motion_torques, next_stage
+from qdos_brax.collection.experts.rising import LIES, WALKS, Motions, Rising, motion_torques, next_stage
 
 STEPS = 240
 """Control steps within which a dropped body lies, turns if it has to, and crouches."""
@@ -39,7 +40,6 @@ def dropped(engine: Engine, key: jax.Array, count: int) -> PipelineState:
     return jax.vmap(engine.init)(qpos, 0.1 * jax.random.normal(qvel_key, (count, engine.nv)))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
 def arrivals(
     engine: Engine, stage: int, motions: Motions, state: PipelineState, noise: jax.Array, key: jax.Array
 ) -> Arrivals:
@@ -47,13 +47,43 @@ def arrivals(
 
     Args:
         engine: the physics.
-        stage: one of ``rising``'s stages.
+        stage: one of ``rising``'s stages, up to RISES.
         motions: the motions.
         state: n states.
         noise: float[n, 1], standard deviation of the noise on the torques.
         key: random key of the noise.
     """
+    return _arrivals(engine, stage, motions, partial(motion_torques, motions), state, noise, key)
 
+
+def hand_overs(engine: Engine, recovery: Rising, state: PipelineState, key: jax.Array) -> Arrivals:
+    """Simulate STEPS control steps of n bodies that fall and get up; return where the walker first takes over.
+
+    Args:
+        engine: the physics.
+        recovery: gets them up, without noise as in data.
+        state: n states.
+        key: random key.
+    """
+    still = jnp.zeros(21)
+
+    def act(memory: jax.Array, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+        return recovery.act(memory, qpos, qvel, still)
+
+    quiet = jnp.zeros((state.qpos.shape[0], 1))
+    return _arrivals(engine, WALKS, recovery.motions, act, state, quiet, key)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 3))
+def _arrivals(
+    engine: Engine,
+    stage: int,
+    motions: Motions,
+    act: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
+    state: PipelineState,
+    noise: jax.Array,
+    key: jax.Array,
+) -> Arrivals:
     def step(carry: tuple[PipelineState, jax.Array, Arrivals], key: jax.Array) -> tuple[tuple, None]:
         state, memory, first = carry
         memory = jax.vmap(partial(next_stage, motions))(memory, state.qpos, state.qvel)
@@ -62,7 +92,7 @@ def arrivals(
             jnp.where(arrives[:, None], now, before)
             for now, before in ((state.qpos, first.qpos), (state.qvel, first.qvel))
         )
-        torques = jax.vmap(partial(motion_torques, motions))(memory, state.qpos, state.qvel)
+        torques = jax.vmap(act)(memory, state.qpos, state.qvel)
         torques = jnp.clip(torques + noise * jax.random.normal(key, torques.shape), -1.0, 1.0)
         state = jax.vmap(engine.step)(state, torques)
         return (state, memory, Arrivals(qpos, qvel, first.arrived | arrives)), None

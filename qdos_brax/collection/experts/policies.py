@@ -44,6 +44,9 @@ _SWING_SCALE = 0.1  # of the joints
 MAX_TURN = 0.7
 """Largest angle between a humanoid's facing direction and its command, rad: sharper turns make it fall more often."""
 
+MAZE_TURN = 1.2
+"""The same in mazes, where a humanoid has to turn in 0.4 m, rad."""
+
 
 class Expert(Protocol):
     """Act on a state and a direction.
@@ -111,8 +114,8 @@ class HumanoidWalker:
 def humanoid_heading(qpos: jax.Array, direction: jax.Array, max_turn: float) -> jax.Array:
     """Return the unit vector[..., 2] closest to ``direction[..., 2]`` within ``max_turn`` rad of where it faces.
 
-    The humanoid thus turns in a curve; it falls when it has to change its course at once. The walker is trained without
-    this limit (with it, it learns to walk at that angle and never to turn) and commanded with it.
+    The humanoid thus turns in a curve; it falls when it has to change its course at once. The walker is trained to see
+    such directions alone, and rewarded for the whole turn (for the limited one, it would walk at that angle for ever).
     """
     facing = unit_vector(forward_axis(qpos)[..., :2])
     seen = to_direction_frame(direction, facing)

@@ -13,11 +13,11 @@ import pytest
 from envs.mazes import models
 from envs.physics.mujoco.engine import MujocoEngine
 from qdos_brax.collection.experts import falls, policies, rising
+from qdos_brax.collection.experts.policies import MAZE_TURN
 from qdos_brax.collection.experts.poses import humanoid_is_up
 from qdos_brax.collection.experts.rising import CROUCHES, LIES, RISES, TURNS, WALKS, Motion, Motions
 from qdos_brax.collection.experts.symmetry import HUMANOID_ACTUATED, mirrored_action
 from qdos_brax.collection.experts.views import random_direction
-from qdos_brax.collection.profiles import MAZE_TURN
 from qdos_brax.errors import UserError
 
 HALF = float(np.sqrt(0.5))

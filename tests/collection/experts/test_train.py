@@ -12,6 +12,8 @@ import pytest
 
 from envs.physics.base import PipelineState
 from qdos_brax.collection.experts import symmetry, weights
+from qdos_brax.collection.experts.policies import humanoid_view
+from qdos_brax.collection.experts.poses import humanoid_is_up
 from qdos_brax.collection.experts.tasks import TASKS, HumanoidRising, HumanoidWalking
 from qdos_brax.collection.experts.tasks.base import EnvState, StepResult
 from qdos_brax.collection.experts.train import Training, main, read_learner
@@ -19,6 +21,7 @@ from qdos_brax.collection.experts.trainer import Sizes, Trainer
 from qdos_brax.collection.experts.views import forward_axis, random_direction, to_direction_frame, to_world_frame
 from qdos_brax.data.transitions import Transition
 from qdos_brax.errors import UserError, guarded
+from qdos_brax.nn.vectors import unit_vector
 
 SIZES = Sizes(
     num_envs=8,
@@ -145,8 +148,15 @@ def test_rewards_of_the_dribble_by_hand() -> None:
     assert result.truncated and not result.alive
 
 
-def test_rewards_of_the_humanoid_by_hand() -> None:
-    task = HumanoidWalking()
+@pytest.fixture(scope="module")
+def walking() -> HumanoidWalking:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HumanoidWalking, "RISEN", 8)
+        return HumanoidWalking()
+
+
+def test_rewards_of_the_humanoid_by_hand(walking: HumanoidWalking) -> None:
+    task = walking
     state = task.reset(jax.random.key(0)).replace(direction=jnp.array([0.0, 1.0]))
     yaw = jnp.array([jnp.cos(jnp.pi / 4), 0.0, 0.0, jnp.sin(jnp.pi / 4)])  # faces +y
     qpos = state.pipeline.qpos.at[:2].set(0.0).at[3:7].set(yaw)
@@ -156,6 +166,27 @@ def test_rewards_of_the_humanoid_by_hand() -> None:
     np.testing.assert_allclose(result.reward, 1.5 + 0.3 + 0.2 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
     assert result.alive
     assert not task.evaluate_step(before, jnp.zeros(21), state.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
+
+
+def test_walking_begins_on_its_feet_or_where_it_has_risen(walking: HumanoidWalking) -> None:
+    state = jax.jit(jax.vmap(walking.reset))(jax.random.split(jax.random.key(0), 64))
+    rose = np.asarray(jnp.abs(state.pipeline.qpos[:, 7:]).max(axis=1) > 0.05)  # a body set on its feet is straight
+    assert 0.25 < rose.mean() < 0.55  # 0.4 of them
+    assert humanoid_is_up(state.pipeline.qpos).all()
+    aside = jnp.sum(unit_vector(forward_axis(state.pipeline.qpos)[:, :2]) * state.direction, axis=1)
+    assert aside[~rose].mean() > 0.7 and aside[rose].min() < -0.5  # it may have risen with its back to its way
+
+
+def test_a_walker_sees_its_direction_as_it_will_be_led(walking: HumanoidWalking) -> None:
+    state = walking.reset(jax.random.key(0))
+    qpos = state.pipeline.qpos.at[3:7].set(jnp.array([1.0, 0, 0, 0]))  # faces +x
+    for angle, seen in ((1.0, 1.0), (2.5, 1.2), (-3.0, -1.2)):
+        led = state.replace(
+            pipeline=state.pipeline.replace(qpos=qpos), direction=jnp.array([np.cos(angle), np.sin(angle)])
+        )
+        heading = jnp.array([np.cos(seen), np.sin(seen)])
+        expected = humanoid_view(qpos, state.pipeline.qvel, heading)
+        np.testing.assert_allclose(walking.observe(led), expected, atol=1e-5)
 
 
 def test_rising_begins_in_a_crouch_or_on_its_feet_and_ends_where_it_sits(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,8 +203,8 @@ def test_rising_begins_in_a_crouch_or_on_its_feet_and_ends_where_it_sits(monkeyp
     assert not task.evaluate_step(first, jnp.zeros(21), crouching.replace(qpos=crouching.qpos.at[2].set(0.4))).alive
 
 
-def test_a_mirrored_humanoid_moves_as_its_image() -> None:
-    task = HumanoidWalking()
+def test_a_mirrored_humanoid_moves_as_its_image(walking: HumanoidWalking) -> None:
+    task = walking
     model, rng = task.engine.model, np.random.default_rng(0)
     np.testing.assert_array_equal(symmetry.HUMANOID_ACTUATED, model.actuator_trnid[:, 0] - 1)
     state = task.reset(jax.random.key(1)).replace(direction=jnp.array([1.0, 0.0]))

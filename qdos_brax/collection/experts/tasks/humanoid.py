@@ -14,6 +14,7 @@ from qdos_brax.collection.experts.tasks.base import EnvState, StepResult
 from qdos_brax.collection.experts.views import (
     direction_of,
     forward_axis,
+    random_direction,
     to_direction_frame,
     uprightness,
 )
@@ -21,19 +22,17 @@ from qdos_brax.data.transitions import Transition
 from qdos_brax.nn.vectors import unit_vector
 
 
-class HumanoidWalking:
+class _Humanoid:
     """Reward walking upright along the direction, 40 control steps per second.
 
     Reward per control step: mainly for speed along the direction, a parabola that is 0 at rest and 2 at PACE (faster,
     the body would run and fall); a quarter of that for being upright and facing the direction (with more, it learns to
-    stand still); minus terms for sideways speed and for effort. A fall ends the episode. The first direction is close
-    to where the body faces; later ones are drawn now and then. Episodes are short because most falls happen at the
-    start.
+    stand still); minus terms for sideways speed and for effort. A fall ends the episode. The body sees the direction as
+    it will be led, at most ``policies.MAZE_TURN`` aside, and is rewarded for the whole turn.
     """
 
-    name = "humanoid_walker"
     observation_dim, action_dim = 55, 21
-    discount, episode_steps, direction_steps, action_noise = 0.99, 300, 400, 0.2
+    discount, action_noise = 0.99, 0.2
 
     PACE = 1.2  # m/s
 
@@ -41,18 +40,11 @@ class HumanoidWalking:
         self.engine = MujocoEngine(models.humanoid_model(), threads=1)
         self._seconds = self.engine.frame_skip * self.engine.model.opt.timestep
 
-    def reset(self, key: jax.Array) -> EnvState:
-        """Draw a humanoid on its feet, the direction mostly ahead of it."""
-        pose_key, qvel_key, yaw_key, direction_key = jax.random.split(key, 4)
-        yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
-        qpos, qvel = standing_humanoid(pose_key, yaw)
-        qvel = qvel + 0.1 * jax.random.normal(qvel_key, qvel.shape)
-        direction = direction_of(yaw + 0.6 * jax.random.normal(direction_key))
-        return EnvState(self.engine.init(qpos, qvel), direction, jnp.zeros((), jnp.int32))
-
     def observe(self, state: EnvState) -> jax.Array:
         """Return the body's view, float[55]."""
-        return policies.humanoid_view(state.pipeline.qpos, state.pipeline.qvel, state.direction)
+        qpos, qvel = state.pipeline.qpos, state.pipeline.qvel
+        heading = policies.humanoid_heading(qpos, state.direction, policies.MAZE_TURN)
+        return policies.humanoid_view(qpos, qvel, heading)
 
     def torques(self, state: EnvState, action: jax.Array) -> jax.Array:
         """Return float[21] that pull the joints to the targets in ``action``."""
@@ -78,10 +70,54 @@ class HumanoidWalking:
 
     def mirror(self, batch: Transition) -> Transition:
         """Exchange left and right: the body and the reward are symmetric."""
-        return _mirrored(batch)
+        return batch._replace(
+            observation=symmetry.mirrored_view(batch.observation),
+            action=symmetry.mirrored_action(batch.action),
+            next_observation=symmetry.mirrored_view(batch.next_observation),
+        )
+
+    def _on_feet(self, key: jax.Array) -> EnvState:
+        """Draw a humanoid on its feet, the direction mostly ahead of it."""
+        pose_key, qvel_key, yaw_key, direction_key = jax.random.split(key, 4)
+        yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
+        qpos, qvel = standing_humanoid(pose_key, yaw)
+        qvel = qvel + 0.1 * jax.random.normal(qvel_key, qvel.shape)
+        return self._begin(qpos, qvel, direction_of(yaw + 0.6 * jax.random.normal(direction_key)))
+
+    def _begin(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> EnvState:
+        return EnvState(self.engine.init(qpos, qvel), direction, jnp.zeros((), jnp.int32))
 
 
-class HumanoidRising(HumanoidWalking):
+class HumanoidWalking(_Humanoid):
+    """Reward walking as a maze asks for it, with turns, and from wherever a body has risen.
+
+    RISEN_SHARE of the episodes begin where ``experts.rising`` hands over, with any direction; the others on the feet,
+    the direction close to where the body faces. Later directions are drawn often, and of any kind.
+    """
+
+    name = "humanoid_walker"
+    episode_steps, direction_steps = 400, 100
+
+    RISEN_SHARE = 0.4
+    RISEN = 512  # bodies, drawn once
+
+    def __init__(self) -> None:
+        super().__init__()
+        drop_key, key = jax.random.split(jax.random.key(0))
+        state = falls.dropped(self.engine, drop_key, self.RISEN)
+        self._risen = falls.hand_overs(self.engine, rising.humanoid_rising(), state, key)
+
+    def reset(self, key: jax.Array) -> EnvState:
+        """Draw a humanoid on its feet, or one that has just risen, and a direction."""
+        kind_key, stand_key, index_key, direction_key = jax.random.split(key, 4)
+        standing = self._on_feet(stand_key)
+        index = jax.random.categorical(index_key, jnp.where(self._risen.arrived, 0.0, -jnp.inf))
+        risen = self._begin(self._risen.qpos[index], self._risen.qvel[index], random_direction(direction_key))
+        has_risen = jax.random.bernoulli(kind_key, self.RISEN_SHARE)
+        return jax.tree.map(lambda a, b: jnp.where(has_risen, a, b), risen, standing)
+
+
+class HumanoidRising(_Humanoid):
     """Reward walking likewise, from the crouches in which the motions of ``experts.rising`` leave a body that fell.
 
     The body is to walk where it faces. STANDING_SHARE of the episodes begin on their feet. An episode ends where the
@@ -106,22 +142,13 @@ class HumanoidRising(HumanoidWalking):
     def reset(self, key: jax.Array) -> EnvState:
         """Draw a crouching or a standing body, and its facing direction."""
         kind_key, crouch_key, stand_key = jax.random.split(key, 3)
-        standing = super().reset(stand_key).pipeline
-        crouches = self._crouches
+        standing, crouches = self._on_feet(stand_key).pipeline, self._crouches
         index = jax.random.categorical(crouch_key, jnp.where(crouches.arrived, 0.0, -jnp.inf))
         stands = jax.random.bernoulli(kind_key, self.STANDING_SHARE)
         qpos = jnp.where(stands, standing.qpos, crouches.qpos[index])
         qvel = jnp.where(stands, standing.qvel, crouches.qvel[index])
-        return EnvState(self.engine.init(qpos, qvel), unit_vector(forward_axis(qpos)[:2]), jnp.zeros((), jnp.int32))
+        return self._begin(qpos, qvel, unit_vector(forward_axis(qpos)[:2]))
 
     def is_up(self, qpos: jax.Array) -> jax.Array:
         """Return bool[...]: the body crouches or stands."""
         return (qpos[..., 2] > self.LOWEST) & (uprightness(qpos) > 0.3)
-
-
-def _mirrored(batch: Transition) -> Transition:
-    return batch._replace(
-        observation=symmetry.mirrored_view(batch.observation),
-        action=symmetry.mirrored_action(batch.action),
-        next_observation=symmetry.mirrored_view(batch.next_observation),
-    )
