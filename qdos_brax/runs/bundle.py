@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from qdos_brax.errors import UserError
 from qdos_brax.files import parse_json, replacing
@@ -38,7 +38,7 @@ class Bundle(NamedTuple):
 
 
 def write(path: Path, bundle: Bundle) -> None:
-    """Write a bundle as a whole or not at all.
+    """Write a bundle as a whole or not at all; the same bundle gives the same bytes.
 
     Raises:
         UserError: the file cannot be written.
@@ -47,7 +47,7 @@ def write(path: Path, bundle: Bundle) -> None:
     card = json.dumps(bundle.card)
     header = {"kind": _KIND, "format": str(FORMAT), "card": card, "sha256": _digest(card, flat)}
     with replacing(path) as partial:
-        save_file(flat, partial, header)
+        partial.write_bytes(_with_sorted_metadata(save(flat, header)))
 
 
 def read(path: Path) -> Bundle:
@@ -89,6 +89,20 @@ def _digest(card: str, flat: Mapping[str, np.ndarray]) -> str:
         digest.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.data if array.size else b"")
     return digest.hexdigest()
+
+
+def _with_sorted_metadata(file: bytes) -> bytes:
+    """Return a file of safetensors, its metadata in the order of their names: the library's order is random.
+
+    The file is the header's length as 8 bytes, the header as JSON, and the numbers, at offsets from the header's end
+    (https://github.com/huggingface/safetensors#format).
+    """
+    begin = 8 + int.from_bytes(file[:8], "little")
+    header = json.loads(file[8:begin])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # the numbers stay aligned
+    return len(text).to_bytes(8, "little") + text + file[begin:]
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:

@@ -62,6 +62,16 @@ def test_the_round_trip_is_exact(finished: Path, exported: Path, capsys: pytest.
     assert len(played) == 4 and played[:2] == played[2:] and "length 25" in played[0]
 
 
+def test_the_same_bundle_gives_the_same_bytes(exported: Path, tmp_path: Path) -> None:
+    found = bundle.read(exported)
+    for name in ("a", "b", "c", "d"):
+        bundle.write(tmp_path / name, found)
+        assert (tmp_path / name).read_bytes() == exported.read_bytes()
+    size = int.from_bytes(exported.read_bytes()[:8], "little")
+    header = json.loads(exported.read_bytes()[8 : 8 + size])
+    assert size % 8 == 0 and list(header["__metadata__"]) == ["card", "format", "kind", "sha256"]
+
+
 def test_one_member_is_written_with_its_own_seed(finished: Path, tmp_path: Path) -> None:
     file = tmp_path / "one.safetensors"
     assert main(["export", str(finished), "--out", str(file), "--member", "1"]) == 0
