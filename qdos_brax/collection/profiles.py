@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 from envs.mazes.maze_task import MazeTask
 from qdos_brax.collection.experts import policies
@@ -52,7 +51,7 @@ def profile_of(env: MazeTask) -> CollectionProfile:
 ANT = CollectionProfile(policies.ant_walker, NoRecovery, CellSteering, heavy_noise=1.0, stitch_steps=200)
 
 HUMANOID = CollectionProfile(
-    partial(policies.humanoid_walker, max_turn=policies.MAZE_TURN),
+    policies.humanoid_walker,
     humanoid_rising,
     CurvedSteering,
     heavy_noise=0.4,

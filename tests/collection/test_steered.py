@@ -30,14 +30,15 @@ def test_falls_are_counted_per_step_of_walking_and_told_by_their_place() -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.2])
 def test_the_steered_humanoid_reaches_the_tasks_goal(noise: float) -> None:
-    row = steered.measure(envs.make("humanoidmaze-medium-task1", physics="mujoco"), noise, "task", 64, seed=1)
+    row = steered.measure(envs.make("humanoidmaze-medium-task1", physics="mujoco"), noise, "task", 64, seed=2)
     print(row)
-    assert row["reached"] >= 0.9
-    assert row["falls_per_1000"] < 0.6
+    assert row["reached"] >= 0.95
+    assert row["falls_per_1000"] < 0.2
 
 
 @pytest.mark.slow
 def test_the_steered_humanoid_seldom_falls_in_data() -> None:
-    row = steered.measure(envs.make("humanoidmaze-medium-task1", physics="mujoco"), 0.2, "random", 64, seed=1)
+    row = steered.measure(envs.make("humanoidmaze-medium-task1", physics="mujoco"), 0.2, "random", 64, seed=2)
     print(row)
-    assert row["falls_per_1000"] < 0.6
+    assert row["arrivals"] >= 2.5
+    assert row["falls_per_1000"] < 0.45

@@ -1,4 +1,4 @@
-"""Bodies that fell: dropped as the humanoid's task drops them, and where a stage of getting up begins."""
+"""Bodies that fell: dropped as the humanoid's task drops them, and where a stage of getting up, or walking, begins."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from envs.physics.base import Engine, PipelineState
 from qdos_brax.collection.experts.rising import LIES, WALKS, Motions, Rising, motion_torques, next_stage
 
 STEPS = 240
-"""Control steps within which a dropped body lies, turns if it has to, and crouches."""
+"""Control steps within which a dropped body lies, turns if it has to, crouches, and rises."""
 
 
 class Arrivals(NamedTuple):
@@ -40,6 +40,7 @@ def dropped(engine: Engine, key: jax.Array, count: int) -> PipelineState:
     return jax.vmap(engine.init)(qpos, 0.1 * jax.random.normal(qvel_key, (count, engine.nv)))
 
 
+@partial(jax.jit, static_argnums=(0, 1))
 def arrivals(
     engine: Engine, stage: int, motions: Motions, state: PipelineState, noise: jax.Array, key: jax.Array
 ) -> Arrivals:
@@ -47,7 +48,7 @@ def arrivals(
 
     Args:
         engine: the physics.
-        stage: one of ``rising``'s stages, up to RISES.
+        stage: LIES, TURNS, CROUCHES or RISES; from RISES on a riser would have to act (``hand_overs``).
         motions: the motions.
         state: n states.
         noise: float[n, 1], standard deviation of the noise on the torques.
@@ -56,6 +57,7 @@ def arrivals(
     return _arrivals(engine, stage, motions, partial(motion_torques, motions), state, noise, key)
 
 
+@partial(jax.jit, static_argnums=(0, 1))
 def hand_overs(engine: Engine, recovery: Rising, state: PipelineState, key: jax.Array) -> Arrivals:
     """Simulate STEPS control steps of n bodies that fall and get up; return where the walker first takes over.
 
@@ -65,16 +67,11 @@ def hand_overs(engine: Engine, recovery: Rising, state: PipelineState, key: jax.
         state: n states.
         key: random key.
     """
-    still = jnp.zeros(21)
-
-    def act(memory: jax.Array, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-        return recovery.act(memory, qpos, qvel, still)
-
+    act = partial(recovery.act, action=jnp.zeros(21))
     quiet = jnp.zeros((state.qpos.shape[0], 1))
     return _arrivals(engine, WALKS, recovery.motions, act, state, quiet, key)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 3))
 def _arrivals(
     engine: Engine,
     stage: int,

@@ -41,11 +41,8 @@ _OVERRIDE = 1.5  # weight of the learned heading, enough to turn to any directio
 _SPIN_SCALE = 0.25  # of the root
 _SWING_SCALE = 0.1  # of the joints
 
-MAX_TURN = 0.7
-"""Largest angle between a humanoid's facing direction and its command, rad: sharper turns make it fall more often."""
-
-MAZE_TURN = 1.2
-"""The same in mazes, where a humanoid has to turn in 0.4 m, rad."""
+MAX_TURN = 1.2
+"""Largest angle between where a humanoid faces and its command, rad; sharper turns make it fall more often."""
 
 
 class Expert(Protocol):

@@ -154,6 +154,7 @@ def test_the_dribbler_gets_the_ball_out_of_a_corner_and_along_a_wall() -> None:
 @pytest.mark.slow
 def test_the_humanoid_walks(monkeypatch: pytest.MonkeyPatch) -> None:
     """64 episodes of 1,000 steps from standing, each along a direction of its own, without noise."""
+    monkeypatch.setattr(HumanoidWalking, "RISEN", 1)
     monkeypatch.setattr(HumanoidWalking, "RISEN_SHARE", 0.0)
     task, walker, episodes = HumanoidWalking(), policies.humanoid_walker(), 64
     reset_key, direction_key = jax.random.split(jax.random.key(7))
@@ -170,5 +171,5 @@ def test_the_humanoid_walks(monkeypatch: pytest.MonkeyPatch) -> None:
     (_, is_up), way = jax.jit(lambda carry: jax.lax.scan(step, carry, length=1000))(start)
     speed, fell = float(way.sum(axis=0).mean() / 25.0), 1.0 - float(is_up.mean())
     print(f"{speed:.3f} m/s along the direction, {fell:.3f} fell")
-    assert speed >= 1.0
+    assert speed >= 1.3
     assert fell < 0.05

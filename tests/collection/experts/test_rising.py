@@ -13,7 +13,7 @@ import pytest
 from envs.mazes import models
 from envs.physics.mujoco.engine import MujocoEngine
 from qdos_brax.collection.experts import falls, policies, rising
-from qdos_brax.collection.experts.policies import MAZE_TURN
+from qdos_brax.collection.experts.policies import MAX_TURN
 from qdos_brax.collection.experts.poses import humanoid_is_up
 from qdos_brax.collection.experts.rising import CROUCHES, LIES, RISES, TURNS, WALKS, Motion, Motions
 from qdos_brax.collection.experts.symmetry import HUMANOID_ACTUATED, mirrored_action
@@ -114,7 +114,7 @@ def test_bodies_dropped_as_the_task_drops_them_end_in_a_crouch() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("max_turn", [1.0, MAZE_TURN])
+@pytest.mark.parametrize("max_turn", [1.0, MAX_TURN])
 def test_a_dropped_humanoid_gets_up_and_walks_on(max_turn: float) -> None:
     """256 of the task's own resets, 20 s each without noise, then along a direction of their own."""
     episodes, steps = 256, 800

@@ -156,20 +156,20 @@ def walking() -> HumanoidWalking:
 
 
 def test_rewards_of_the_humanoid_by_hand(walking: HumanoidWalking) -> None:
-    task = walking
-    state = task.reset(jax.random.key(0)).replace(direction=jnp.array([0.0, 1.0]))
+    state = walking.reset(jax.random.key(0)).replace(direction=jnp.array([0.0, 1.0]))
     yaw = jnp.array([jnp.cos(jnp.pi / 4), 0.0, 0.0, jnp.sin(jnp.pi / 4)])  # faces +y
     qpos = state.pipeline.qpos.at[:2].set(0.0).at[3:7].set(yaw)
     before = state.replace(pipeline=state.pipeline.replace(qpos=qpos))
     after = state.pipeline.replace(qpos=qpos.at[:2].set(jnp.array([0.01, 0.015])))  # 0.025 s: 0.4 m/s aside, 0.6 m/s on
-    result = task.evaluate_step(before, jnp.full(21, 0.5), after)
+    result = walking.evaluate_step(before, jnp.full(21, 0.5), after)
     np.testing.assert_allclose(result.reward, 1.5 + 0.3 + 0.2 - 0.2 * 0.4 - 0.1 * 0.25, atol=1e-5)
     assert result.alive
-    assert not task.evaluate_step(before, jnp.zeros(21), state.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
+    assert not walking.evaluate_step(before, jnp.zeros(21), state.pipeline.replace(qpos=qpos.at[2].set(0.8))).alive
 
 
 def test_walking_begins_on_its_feet_or_where_it_has_risen(walking: HumanoidWalking) -> None:
     state = jax.jit(jax.vmap(walking.reset))(jax.random.split(jax.random.key(0), 64))
+    assert walking._risen.arrived.mean() > 0.8
     rose = np.asarray(jnp.abs(state.pipeline.qpos[:, 7:]).max(axis=1) > 0.05)  # a body set on its feet is straight
     assert 0.25 < rose.mean() < 0.55  # 0.4 of them
     assert humanoid_is_up(state.pipeline.qpos).all()
@@ -204,10 +204,9 @@ def test_rising_begins_in_a_crouch_or_on_its_feet_and_ends_where_it_sits(monkeyp
 
 
 def test_a_mirrored_humanoid_moves_as_its_image(walking: HumanoidWalking) -> None:
-    task = walking
-    model, rng = task.engine.model, np.random.default_rng(0)
+    model, rng = walking.engine.model, np.random.default_rng(0)
     np.testing.assert_array_equal(symmetry.HUMANOID_ACTUATED, model.actuator_trnid[:, 0] - 1)
-    state = task.reset(jax.random.key(1)).replace(direction=jnp.array([1.0, 0.0]))
+    state = walking.reset(jax.random.key(1)).replace(direction=jnp.array([1.0, 0.0]))
     qpos = state.pipeline.qpos + jnp.asarray(rng.uniform(-0.2, 0.2, 28))
     qvel = jnp.asarray(rng.normal(size=27))
     action = jnp.asarray(rng.uniform(-1, 1, 21), jnp.float32)
@@ -218,18 +217,18 @@ def test_a_mirrored_humanoid_moves_as_its_image(walking: HumanoidWalking) -> Non
         speed = qvel[:6] * jnp.array([1.0, -1, 1, -1, 1, -1])
         return jnp.concatenate([place, joints[7:28]]), jnp.concatenate([speed, joints[34:]])
 
-    here = state.replace(pipeline=task.engine.init(qpos, qvel))
-    there = state.replace(pipeline=task.engine.init(*image(qpos, qvel)))
-    row = Transition(task.observe(here), action, jnp.zeros(()), jnp.ones(()), task.observe(here))
-    seen = task.mirror(row)
-    np.testing.assert_allclose(task.observe(there), seen.observation, atol=1e-5)
-    torques = task.torques(here, action)
-    torques_there = task.torques(there, seen.action)
+    here = state.replace(pipeline=walking.engine.init(qpos, qvel))
+    there = state.replace(pipeline=walking.engine.init(*image(qpos, qvel)))
+    row = Transition(walking.observe(here), action, jnp.zeros(()), jnp.ones(()), walking.observe(here))
+    seen = walking.mirror(row)
+    np.testing.assert_allclose(walking.observe(there), seen.observation, atol=1e-5)
+    torques = walking.torques(here, action)
+    torques_there = walking.torques(there, seen.action)
     np.testing.assert_allclose(torques_there, symmetry.mirrored_action(torques), atol=1e-5)
     assert not np.allclose(torques_there, torques, atol=0.1)
     for _ in range(4):
         here, there = (
-            state.replace(pipeline=task.engine.step(state.pipeline, torque))
+            state.replace(pipeline=walking.engine.step(state.pipeline, torque))
             for state, torque in ((here, torques), (there, torques_there))
         )
     expected = image(here.pipeline.qpos, here.pipeline.qvel)

@@ -27,8 +27,7 @@ class _Humanoid:
 
     Reward per control step: mainly for speed along the direction, a parabola that is 0 at rest and 2 at PACE (faster,
     the body would run and fall); a quarter of that for being upright and facing the direction (with more, it learns to
-    stand still); minus terms for sideways speed and for effort. A fall ends the episode. The body sees the direction as
-    it will be led, at most ``policies.MAZE_TURN`` aside, and is rewarded for the whole turn.
+    stand still); minus terms for sideways speed and for effort. A fall ends the episode.
     """
 
     observation_dim, action_dim = 55, 21
@@ -42,9 +41,7 @@ class _Humanoid:
 
     def observe(self, state: EnvState) -> jax.Array:
         """Return the body's view, float[55]."""
-        qpos, qvel = state.pipeline.qpos, state.pipeline.qvel
-        heading = policies.humanoid_heading(qpos, state.direction, policies.MAZE_TURN)
-        return policies.humanoid_view(qpos, qvel, heading)
+        return policies.humanoid_view(state.pipeline.qpos, state.pipeline.qvel, state.direction)
 
     def torques(self, state: EnvState, action: jax.Array) -> jax.Array:
         """Return float[21] that pull the joints to the targets in ``action``."""
@@ -76,13 +73,13 @@ class _Humanoid:
             next_observation=symmetry.mirrored_view(batch.next_observation),
         )
 
-    def _on_feet(self, key: jax.Array) -> EnvState:
-        """Draw a humanoid on its feet, the direction mostly ahead of it."""
+    def _on_feet(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Draw (qpos[28], qvel[27], direction[2]) of a humanoid on its feet, the direction mostly ahead of it."""
         pose_key, qvel_key, yaw_key, direction_key = jax.random.split(key, 4)
         yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
         qpos, qvel = standing_humanoid(pose_key, yaw)
         qvel = qvel + 0.1 * jax.random.normal(qvel_key, qvel.shape)
-        return self._begin(qpos, qvel, direction_of(yaw + 0.6 * jax.random.normal(direction_key)))
+        return qpos, qvel, direction_of(yaw + 0.6 * jax.random.normal(direction_key))
 
     def _begin(self, qpos: jax.Array, qvel: jax.Array, direction: jax.Array) -> EnvState:
         return EnvState(self.engine.init(qpos, qvel), direction, jnp.zeros((), jnp.int32))
@@ -92,7 +89,8 @@ class HumanoidWalking(_Humanoid):
     """Reward walking as a maze asks for it, with turns, and from wherever a body has risen.
 
     RISEN_SHARE of the episodes begin where ``experts.rising`` hands over, with any direction; the others on the feet,
-    the direction close to where the body faces. Later directions are drawn often, and of any kind.
+    the direction close to where the body faces. Later directions are drawn often, and of any kind. The body sees them
+    as it will be led, at most ``policies.MAX_TURN`` aside, and is rewarded for the whole turn.
     """
 
     name = "humanoid_walker"
@@ -107,14 +105,18 @@ class HumanoidWalking(_Humanoid):
         state = falls.dropped(self.engine, drop_key, self.RISEN)
         self._risen = falls.hand_overs(self.engine, rising.humanoid_rising(), state, key)
 
+    def observe(self, state: EnvState) -> jax.Array:
+        """Return the body's view of the direction in which it will be led, float[55]."""
+        heading = policies.humanoid_heading(state.pipeline.qpos, state.direction, policies.MAX_TURN)
+        return super().observe(state.replace(direction=heading))
+
     def reset(self, key: jax.Array) -> EnvState:
         """Draw a humanoid on its feet, or one that has just risen, and a direction."""
         kind_key, stand_key, index_key, direction_key = jax.random.split(key, 4)
-        standing = self._on_feet(stand_key)
-        index = jax.random.categorical(index_key, jnp.where(self._risen.arrived, 0.0, -jnp.inf))
-        risen = self._begin(self._risen.qpos[index], self._risen.qvel[index], random_direction(direction_key))
+        risen = (*_drawn(index_key, self._risen), random_direction(direction_key))
         has_risen = jax.random.bernoulli(kind_key, self.RISEN_SHARE)
-        return jax.tree.map(lambda a, b: jnp.where(has_risen, a, b), risen, standing)
+        start = (jnp.where(has_risen, a, b) for a, b in zip(risen, self._on_feet(stand_key), strict=True))
+        return self._begin(*start)
 
 
 class HumanoidRising(_Humanoid):
@@ -142,13 +144,17 @@ class HumanoidRising(_Humanoid):
     def reset(self, key: jax.Array) -> EnvState:
         """Draw a crouching or a standing body, and its facing direction."""
         kind_key, crouch_key, stand_key = jax.random.split(key, 3)
-        standing, crouches = self._on_feet(stand_key).pipeline, self._crouches
-        index = jax.random.categorical(crouch_key, jnp.where(crouches.arrived, 0.0, -jnp.inf))
         stands = jax.random.bernoulli(kind_key, self.STANDING_SHARE)
-        qpos = jnp.where(stands, standing.qpos, crouches.qpos[index])
-        qvel = jnp.where(stands, standing.qvel, crouches.qvel[index])
+        standing, crouching = self._on_feet(stand_key)[:2], _drawn(crouch_key, self._crouches)
+        qpos, qvel = (jnp.where(stands, a, b) for a, b in zip(standing, crouching, strict=True))
         return self._begin(qpos, qvel, unit_vector(forward_axis(qpos)[:2]))
 
     def is_up(self, qpos: jax.Array) -> jax.Array:
         """Return bool[...]: the body crouches or stands."""
         return (qpos[..., 2] > self.LOWEST) & (uprightness(qpos) > 0.3)
+
+
+def _drawn(key: jax.Array, arrivals: falls.Arrivals) -> tuple[jax.Array, jax.Array]:
+    """Draw (qpos[28], qvel[27]) of one of the bodies that arrived."""
+    index = jax.random.categorical(key, jnp.where(arrivals.arrived, 0.0, -jnp.inf))
+    return arrivals.qpos[index], arrivals.qvel[index]
