@@ -19,7 +19,9 @@ from pathlib import Path
 
 from qdos_brax.errors import guarded
 from qdos_brax.files import write_text
-from qdos_brax.report.study import Study, read_study, varied_keys
+from qdos_brax.report.reading import read_study
+from qdos_brax.report.settings import varied_keys
+from qdos_brax.report.study import Study
 from qdos_brax.runs.comparison import is_comparison
 
 COLUMNS = (

@@ -18,7 +18,7 @@ from qdos_brax.errors import UserError
 from qdos_brax.report.curves import save_figure
 from qdos_brax.report.member_analysis import read_analyses
 from qdos_brax.report.picture import check_name
-from qdos_brax.report.study import read_study
+from qdos_brax.report.reading import read_study
 
 _FRAMES = 4
 _HEIGHT = 300  # pixels of a frame

@@ -17,7 +17,8 @@ from qdos_brax.config.schema import format_value
 from qdos_brax.files import replacing
 from qdos_brax.report.elements import PALETTE
 from qdos_brax.report.series import Curve, Scan, ScanLine, curves, scans
-from qdos_brax.report.study import Study, short_key
+from qdos_brax.report.settings import short_key
+from qdos_brax.report.study import Study
 
 GREYS = ("#4d4d4d", "#7a7a7a", "#a5a5a5")  # of what others published
 SHARES = ("success", "score")  # measures between 0 and 1

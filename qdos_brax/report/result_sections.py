@@ -25,8 +25,9 @@ from qdos_brax.report.elements import (
     title_with_task,
 )
 from qdos_brax.report.series import Curve, Scan, Surface, curves, scans, surfaces
+from qdos_brax.report.settings import short_key
 from qdos_brax.report.statistics import mean_curve
-from qdos_brax.report.study import Member, Setting, Study, final_results, headline, short_key
+from qdos_brax.report.study import Member, Setting, Study, final_results, headline
 from qdos_brax.report.summary_cards import rank_settings, summary_cards
 
 # --- Summary ---------------------------------------------------------------------------------------------------

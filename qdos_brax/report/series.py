@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from qdos_brax.config.schema import format_value
+from qdos_brax.report.settings import short_key
 from qdos_brax.report.statistics import mean_curve
-from qdos_brax.report.study import Member, Setting, Study, headline, short_key
+from qdos_brax.report.study import Member, Setting, Study, headline
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,8 +12,8 @@ from qdos_brax.report.curves import draw_curves, draw_scans
 from qdos_brax.report.member_analysis import read_analyses
 from qdos_brax.report.page import write_page
 from qdos_brax.report.published import published_on
+from qdos_brax.report.reading import read_study
 from qdos_brax.report.static_figures import draw_static_figures
-from qdos_brax.report.study import read_study
 from qdos_brax.report.tables import Table, first_goal_csv, success_csv, tables
 
 

@@ -24,7 +24,7 @@ from qdos_brax.errors import UserError
 from qdos_brax.report.analysis_sections import analysis_sections
 from qdos_brax.report.member_analysis import read_analyses
 from qdos_brax.report.page import write_page
-from qdos_brax.report.study import read_study
+from qdos_brax.report.reading import read_study
 from qdos_brax.runs.folder import RunFolder
 
 CAP, HORIZON, SIZE = 25, 10, 60

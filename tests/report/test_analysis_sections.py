@@ -15,7 +15,7 @@ from qdos_brax.report.analysis_sections import analysis_sections
 from qdos_brax.report.elements import describe
 from qdos_brax.report.member_analysis import quality_colours, quality_groups, quality_names, read_analyses
 from qdos_brax.report.page import write_page
-from qdos_brax.report.study import read_study
+from qdos_brax.report.reading import read_study
 from qdos_brax.report.write import write_report
 from tests.report.folders import write_run
 

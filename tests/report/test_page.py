@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 import pytest
 
 from qdos_brax.report.page import write_page
-from qdos_brax.report.study import read_study
+from qdos_brax.report.reading import read_study
 from tests.report.folders import write_run
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from qdos_brax.errors import UserError
-from qdos_brax.report.study import read_study
+from qdos_brax.report.reading import read_study
 from tests.report.folders import vary, write_run
 
 pytestmark = pytest.mark.quick

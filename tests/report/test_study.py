@@ -12,9 +12,9 @@ import pytest
 
 from qdos_brax.commands import main as commands
 from qdos_brax.report.next_step import advise
+from qdos_brax.report.reading import read_study
 from qdos_brax.report.result_sections import learning_section, summary_section
 from qdos_brax.report.series import curves, mean_over_steps, scans, surfaces
-from qdos_brax.report.study import read_study
 from qdos_brax.report.summary_cards import summary_cards
 from qdos_brax.report.tables import success_csv, tables
 from qdos_brax.report.write import write_report
