@@ -92,3 +92,9 @@ class FlowConfig:
     batch_size: int = count(256, "transitions per gradient step offline")
     learning_rate: Scannable = rate(3e-4, "(dsrl) Adam learning rate of the cloned flow")
     updates: int = count(1_000_000, "gradient steps offline", pretrain=True)
+    conservative_weight: Scannable = number(
+        5.0, "(high_level.initial cal-ql) weight of what holds Q down on decisions that the data lacks"
+    )
+    conservative_actions: int = count(
+        10, "(high_level.initial cal-ql) such decisions per row: uniform ones, and of the actor's, there and one later"
+    )

@@ -176,6 +176,8 @@ _AS_BEFORE = {
     ("high_level", "schedule"): "constant",
     ("high_level", "actor_average"): 1.0,
     ("high_level", "initial"): "random",
+    ("flow", "conservative_weight"): 5.0,
+    ("flow", "conservative_actions"): 10,
     ("labels", "latent"): "sample",
     ("labels", "inputs"): "normalised",
 }
@@ -196,7 +198,7 @@ def config_hash(config: Config) -> str:
         if getattr(config, group) == getattr(Config(), group):
             del content[group]
     for (group, key), value in _AS_BEFORE.items():
-        if content[group][key] == value:
+        if content.get(group, {}).get(key) == value:
             del content[group][key]
     if config.members_per_program == 0 or len(scan.members(config)) == 1:
         del content["members_per_program"]

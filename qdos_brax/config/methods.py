@@ -194,14 +194,15 @@ METHODS = {
     # data" (arXiv 2412.07762; code zhouzypaul/wsrl, its configurations and launch scripts): warm-up of 5,000 steps, 10
     # critics, 2 drawn, 4 critic steps of 256 rows per step, no entropy in the backup. The first temperature is 1 there
     # for rewards of -5 and 5 on ant mazes, 0.1 of ours. Their actor is half as deep on ant mazes, and learns at 1e-4.
-    # IQL in place of their Cal-QL, with the values of their IQL.
+    # Their Cal-QL's conservative weight is a multiplier on ant mazes and without importance weights in kitchens; here
+    # it is that of their OGBench everywhere. IQL in its place (high_level.initial) has the values of their IQL.
     "wsrl": Method(
         "no skills; actor and critics of an offline phase go on online without the data (WSRL, Zhou et al. 2025)",
         low_level="action",
         settings=_FLAT
         | _ONLINE_ONLY
         | {
-            "high_level.initial": "iql",
+            "high_level.initial": "cal-ql",
             "high_level.target_subset": 2,
             "high_level.utd": 4,
             "high_level.init_temperature": 0.1,

@@ -50,10 +50,12 @@ class HighLevelConfig:
     hidden: tuple[int, ...] = widths((256, 256, 256), "hidden layers of actor and critics")
     initial: str = choice(
         "random",
-        "what actor and critics begin as: random networks, or iql (learned from the labelled data by implicit "
-        "Q-learning in flow.updates steps; they play first and learn after high_level.warmup_env_steps, as in WSRL)",
+        "what actor and critics begin as: random networks, or learned from the labelled data in flow.updates steps, by "
+        "implicit Q-learning (iql) or by calibrated conservative Q-learning (cal-ql); they then play first and learn "
+        "after high_level.warmup_env_steps, as in WSRL",
         "random",
         "iql",
+        "cal-ql",
     )
     ensemble: int = count(10, "number of critics")
     target_subset: int = count(1, "critics drawn for the minimum in the target")

@@ -57,6 +57,10 @@ class Dataset:
         """Return int64[E, 2], first row and one past the last row of every episode."""
         return episode_bounds(self.ends)
 
+    def longest_episode(self) -> int:
+        """Return the rows of the longest episode."""
+        return int(np.diff(self.episode_bounds, axis=1).max(initial=0))
+
 
 def episode_bounds(ends: np.ndarray) -> np.ndarray:
     """Return int64[E, 2], [first, one past last) of every episode in ``ends`` (bool[N]); the last row ends one."""

@@ -36,6 +36,7 @@ from qdos_brax.methods.learners_view import learners_env, run_dataset
 from qdos_brax.methods.low_level_kinds import make_low_level, skill_phases
 from qdos_brax.offline.actor_critic import OfflineActorCritic
 from qdos_brax.offline.bc import BC
+from qdos_brax.offline.cal_ql import CalQL
 from qdos_brax.offline.diffusion import DiffusionBC
 from qdos_brax.offline.flat_policy import FlatPolicy
 from qdos_brax.offline.iql_policy import IQLPolicy
@@ -156,8 +157,12 @@ def _warm_start_phases(context: BuildContext, low_level: LowLevelPolicy) -> list
     config = context.config
     if config.high_level.initial == "random":
         return []
-    sac = SAC(context.env.observation_size, low_level.width, config.high_level)
-    learner = WarmStart(sac, config.high_level.hidden, config.skills.horizon, config.flow)
+    sac, horizon = SAC(context.env.observation_size, low_level.width, config.high_level), config.skills.horizon
+    learner: Learner
+    if config.high_level.initial == "iql":
+        learner = WarmStart(sac, config.high_level.hidden, horizon, config.flow)
+    else:
+        learner = CalQL(sac, horizon, context.dataset.longest_episode(), config.flow)
     labels = ("labels",)
     drops = () if _online_reads_labels(config) else labels
     return [offline_phase(context, AGENT, learner, config.flow.updates, reads=labels, drops=drops)]
