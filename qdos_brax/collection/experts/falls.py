@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from envs.mazes.locomotion import dropped_humanoid, dropped_poses
 from envs.physics.base import Engine, PipelineState
 from qdos_brax.collection.experts.rising import LIES, WALKS, Motions, Rising, motion_torques, next_stage
+from qdos_brax.errors import UserError
 
 STEPS = 240
 """Control steps within which a dropped body lies, turns if it has to, crouches, and rises."""
@@ -29,6 +30,19 @@ class Arrivals(NamedTuple):
     qpos: jax.Array
     qvel: jax.Array
     arrived: jax.Array
+
+    def some(self) -> Arrivals:
+        """Return them, of whom at least one arrived.
+
+        Raises:
+            UserError: none did, and episodes would have nowhere to begin.
+        """
+        if not bool(self.arrived.any()):
+            raise UserError(
+                f"none of {len(self.arrived)} fallen humanoids got as far as this expert begins; train the motions and "
+                "the riser first, or put their shipped weights back"
+            )
+        return self
 
 
 def dropped(engine: Engine, key: jax.Array, count: int) -> PipelineState:

@@ -107,10 +107,16 @@ def test_bodies_dropped_as_the_task_drops_them_end_in_a_crouch() -> None:
     drop_key, noise_key = jax.random.split(jax.random.key(5))
     state = falls.dropped(engine, drop_key, 24)
     seen = falls.arrivals(engine, RISES, motions, state, jnp.zeros((24, 1)), noise_key)
-    assert seen.arrived.mean() > 0.9
+    assert seen.arrived.mean() > 0.9 and seen.some() is seen
     tall = np.asarray(seen.qpos[:, 2] > 0.45) & np.asarray(rising.uprightness(seen.qpos) > 0.8)
     assert (tall & np.asarray(seen.arrived)).mean() > 0.85
     assert np.asarray(state.qpos[:, 2] == 1.5).all() and np.abs(seen.qpos[:, 2] - 1.5).min() > 0.5
+
+
+def test_an_expert_that_nobody_reaches_is_refused_before_it_is_trained() -> None:
+    nobody = falls.Arrivals(jnp.zeros((3, 28)), jnp.zeros((3, 27)), jnp.zeros(3, bool))
+    with pytest.raises(UserError, match="none of 3 fallen humanoids got as far"):
+        nobody.some()
 
 
 @pytest.mark.slow

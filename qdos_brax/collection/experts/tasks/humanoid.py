@@ -103,7 +103,7 @@ class HumanoidWalking(_Humanoid):
         super().__init__()
         drop_key, key = jax.random.split(jax.random.key(0))
         state = falls.dropped(self.engine, drop_key, self.RISEN)
-        self._risen = falls.hand_overs(self.engine, rising.humanoid_rising(), state, key)
+        self._risen = falls.hand_overs(self.engine, rising.humanoid_rising(), state, key).some()
 
     def observe(self, state: EnvState) -> jax.Array:
         """Return the body's view of the direction in which it will be led, float[55]."""
@@ -139,7 +139,7 @@ class HumanoidRising(_Humanoid):
         state = falls.dropped(self.engine, drop_key, self.CROUCHES)
         noise = jnp.maximum(jnp.linspace(-self.action_noise, self.action_noise, self.CROUCHES), 0.0)[:, None]
         motions = rising.humanoid_motions()
-        self._crouches = falls.arrivals(self.engine, rising.RISES, motions, state, noise, noise_key)
+        self._crouches = falls.arrivals(self.engine, rising.RISES, motions, state, noise, noise_key).some()
 
     def reset(self, key: jax.Array) -> EnvState:
         """Draw a crouching or a standing body, and its facing direction."""
