@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import numpy as np
+import pytest
 from flax.serialization import to_state_dict
 
 from tests.methods.test_methods import config_of, mean_fewest_steps, phases_of
@@ -69,9 +70,10 @@ def test_a_warm_start_goes_on_without_the_data_and_reaches_the_optimum_of_the_pl
     assert history[-1]["eval/success"][0] == 1.0 and history[-1]["eval/length"][0] < best + 1.0
 
 
-def test_skills_can_be_played_by_a_warm_start_too() -> None:
+@pytest.mark.parametrize("initial", ["iql", "cal-ql"])
+def test_skills_can_be_played_by_a_warm_start_too(initial: str) -> None:
     """Its decisions are the labels of the segments, u of width 2, and its rewards those of whole segments."""
-    sizes = {"flow.updates": 10, "high_level.hidden": [8], "high_level.initial": "iql"}
+    sizes = {"flow.updates": 10, "high_level.hidden": [8], "high_level.initial": initial}
     phases = phases_of(config_of("qdos", **sizes), point_dataset(20))
     assert [phase.name for phase in phases] == ["values", "skills", "label", "agent", "online"]
     labels = jax.random.uniform(jax.random.key(0), (1, 20 * 26, 2), minval=-0.9, maxval=0.9)
