@@ -78,7 +78,7 @@ def family_layers(family: str, method: str, preset: str, variant: str | None = N
     return [
         *([Layer(f"configs/{family}.yaml", read_values(path))] if family in families() else []),
         Layer(f"method {method}", known_keys(method_settings(method, family), f"method {method}")),
-        *_preset_layers(preset, family, variant, METHODS[method].low_level),
+        *_preset_layers(preset, family, variant, method),
     ]
 
 
@@ -153,10 +153,12 @@ def _spec(env: str) -> envs.TaskSpec:
         raise UserError(str(error)) from error
 
 
-def _preset_layers(name: str, family: str, variant: str | None, low_level: str) -> list[Layer]:
+def _preset_layers(name: str, family: str, variant: str | None, method: str) -> list[Layer]:
     """Return a preset's values, those of its sections over them; a family's section may have ``variants``, and over
-    them ``low_level`` again, since how often a method decides weighs more than which of the family's tasks it plays.
+    them ``low_level`` again, since how often a method decides weighs more than which of the family's tasks it plays,
+    and over all of them ``methods``, for what one method alone can do.
     """
+    low_level = METHODS[method].low_level
     if name not in presets():
         raise UserError(f"unknown preset {name!r}{nearest(name, presets())}; there are {', '.join(presets())}")
     path = CONFIG_DIR / "presets" / f"{name}.yaml"
@@ -169,11 +171,13 @@ def _preset_layers(name: str, family: str, variant: str | None, low_level: str) 
         known = sorted(envs.FAMILIES[family].variants) if family in envs.FAMILIES else []
         of_variant = _take_section(of_family, "variants", known, path)
         of_low_level = _take_section(of_family, "low_level", kinds, path)
+        of_method = _take_section(of_family, "methods", list(METHODS), path)
         title = f"{title}, section families.{family}"
         layers.append((title, of_family))
         if variant is not None:
             layers.append((f"{title}.variants.{variant}", of_variant.get(variant)))
         layers.append((f"{title}.low_level.{low_level}", of_low_level.get(low_level)))
+        layers.append((f"{title}.methods.{method}", of_method.get(method)))
     return [Layer(title, known_keys(flat(part), str(path))) for title, part in layers if part]
 
 

@@ -137,7 +137,11 @@ def check_method(config: Config) -> None:
     if high.initial != "random" and config.labels.offline_reward != "data":
         raise UserError(
             f"high_level.initial={high.initial} learns from the data's rewards: labels.offline_reward must be data, "
-            f"not {config.labels.offline_reward}"
+            f"not {config.labels.offline_reward}; or use --set high_level.initial=random"
+        )
+    if high.initial == "cal-ql" and high.regulariser != "entropy":
+        raise UserError(
+            "high_level.initial=cal-ql learns an actor of much entropy: high_level.regulariser must stay entropy"
         )
     if method.offline and config.labels.offline_reward != "data":
         raise UserError(

@@ -76,6 +76,7 @@ families:
     high_level: {discount: 0.8}
     low_level: {action: {high_level: {discount: 0.7}}}
     variants: {medium: {high_level: {discount: 0.6}}}
+    methods: {rlpd: {high_level: {discount: 0.5}}}
 """
     (tmp_path / "presets" / "tiny.yaml").write_text(preset)
     monkeypatch.setattr(configs.layers, "CONFIG_DIR", tmp_path)
@@ -97,8 +98,14 @@ families:
     assert load_config("antmaze-medium-task3", "tiny").high_level.discount == 0.6
     assert load_config("antmaze-medium", "tiny", {"method": "explore"}).high_level.discount == 0.7
     assert load_config("antmaze-large", "tiny").high_level.discount == 0.8
+    # Over everything else of the preset, what is for one method.
+    assert load_config("antmaze-medium", "tiny", {"method": "rlpd"}).high_level.discount == 0.5
+    assert load_config("antsoccer", "tiny", {"method": "rlpd"}).high_level.discount == 0.9
     (tmp_path / "presets" / "tiny.yaml").write_text(preset.replace("medium", "medum"))
     with pytest.raises(UserError, match="unknown entry 'medum' in variants, did you mean 'medium'"):
+        load_config("antmaze-large", "tiny")
+    (tmp_path / "presets" / "tiny.yaml").write_text(preset.replace("rlpd", "rpld"))
+    with pytest.raises(UserError, match="unknown entry 'rpld' in methods, did you mean 'rlpd'"):
         load_config("antmaze-large", "tiny")
 
 
@@ -206,6 +213,9 @@ def test_settings_must_suit_the_method() -> None:
         configs.check_method(load_config("antmaze", "smoke", {"method": "fql", "high_level.initial": "iql"}))
     with pytest.raises(UserError, match=r"initial=iql learns from the data's rewards.*must be data, not min"):
         configs.check_method(load_config("antmaze", "smoke", {"method": "supe", "high_level.initial": "iql"}))
+    held = {"high_level.initial": "cal-ql", "high_level.regulariser": "prior"}
+    with pytest.raises(UserError, match=r"initial=cal-ql learns an actor of much entropy: .*must stay entropy"):
+        configs.check_method(load_config("antmaze", "smoke", held))
     with pytest.raises(UserError, match=r"qc learns offline from the data's rewards: labels.*must be data, not min"):
         configs.check_method(load_config("antmaze", "smoke", {"method": "qc", "labels.offline_reward": "min"}))
     tuned = {"tuning.skills": "guarded", "tuning.window": 8}
