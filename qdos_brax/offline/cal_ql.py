@@ -105,7 +105,7 @@ class CalQL:
         likely: tuple[Proposals, ...],
         returns: jax.Array,
     ) -> jax.Array:
-        """Return by how much Q of proposals exceeds Q of the data's decisions, meaned over the batch, [critics].
+        """Return by how much Q of proposals exceeds Q of the data's decisions, averaged over the batch, [critics].
 
         The soft maximum, log sum exp(Q - log density), of all proposals in the batch's states.
 
