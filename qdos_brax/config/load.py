@@ -141,8 +141,8 @@ def check_method(config: Config) -> None:
         )
     if high.initial == "cal-ql" and high.regulariser != "entropy":
         raise UserError(
-            "high_level.initial=cal-ql learns an actor of much entropy: high_level.regulariser must stay entropy; or use "
-            "--set high_level.initial=random"
+            "high_level.initial=cal-ql learns an actor of much entropy: high_level.regulariser must stay entropy; or "
+            "use --set high_level.initial=random"
         )
     if method.offline and config.labels.offline_reward != "data":
         raise UserError(
