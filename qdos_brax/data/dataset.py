@@ -57,10 +57,6 @@ class Dataset:
         """Return int64[E, 2], first row and one past the last row of every episode."""
         return episode_bounds(self.ends)
 
-    def longest_episode(self) -> int:
-        """Return the rows of the longest episode."""
-        return int(np.diff(self.episode_bounds, axis=1).max(initial=0))
-
 
 def episode_bounds(ends: np.ndarray) -> np.ndarray:
     """Return int64[E, 2], [first, one past last) of every episode in ``ends`` (bool[N]); the last row ends one."""
@@ -70,3 +66,8 @@ def episode_bounds(ends: np.ndarray) -> np.ndarray:
         stops = np.append(stops, n)
     starts = np.concatenate([np.zeros(min(1, len(stops)), np.int64), stops[:-1]])
     return np.stack([starts, stops], axis=1).astype(np.int64)
+
+
+def longest_episode(ends: np.ndarray) -> int:
+    """Return the rows of the longest episode in ``ends`` (bool[N])."""
+    return int(np.diff(episode_bounds(ends), axis=1).max(initial=0))

@@ -9,7 +9,7 @@ import numpy as np
 from envs.task import Task
 from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS
-from qdos_brax.data.dataset import Dataset, episode_bounds
+from qdos_brax.data.dataset import Dataset, longest_episode
 from qdos_brax.data.readers.rows import Rows
 from qdos_brax.data.segments import segment_starts
 from qdos_brax.errors import UserError
@@ -60,7 +60,7 @@ def refuse(source: str, lines: Sequence[str]) -> None:
 def _segments(data: Rows | Dataset, config: Config) -> list[str]:
     """Return a line if no segment lies within one episode."""
     horizon = config.skills.horizon
-    longest = int(np.diff(episode_bounds(data.ends), axis=1).max(initial=0))
+    longest = longest_episode(data.ends)
     if data.mismatch and horizon > 1:
         return [data.mismatch]
     if longest >= horizon:

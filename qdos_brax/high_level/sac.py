@@ -175,10 +175,14 @@ class SAC:
         bootstrap = self.target_value(state, key, batch.next_observation, reference)
         target = jax.lax.stop_gradient(batch.reward + hyper.discount * batch.mask * bootstrap)
         loss, grads = jax.value_and_grad(self.critic_loss)(state.critic, batch, target)
+        info = {"critic_loss": loss / self.ensemble, "q": jnp.mean(target)}
+        return self.move_critic(state, grads, hyper), info
+
+    def move_critic(self, state: SACState, grads: Params, hyper: SACHyper) -> SACState:
+        """Return the state after Adam's step of every critic along ``grads``, which the targets follow."""
         critic, opt_state = adam_step(state.critic, state.critic_opt_state, grads, hyper.learning_rate)
         target_critic = polyak(state.target_critic, critic, hyper.target_rate)
-        info = {"critic_loss": loss / self.ensemble, "q": jnp.mean(target)}
-        return state.replace(critic=critic, critic_opt_state=opt_state, target_critic=target_critic), info
+        return state.replace(critic=critic, critic_opt_state=opt_state, target_critic=target_critic)
 
     def update_actor(
         self,

@@ -14,7 +14,7 @@ import numpy as np
 from qdos_brax import config as configs
 from qdos_brax.config import Config
 from qdos_brax.config.methods import METHODS, Method
-from qdos_brax.data.dataset import Dataset
+from qdos_brax.data.dataset import Dataset, longest_episode
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.requirements import refuse, unmet
 from qdos_brax.high_level.actor_critic import AGENT, ActorCritic
@@ -162,7 +162,7 @@ def _warm_start_phases(context: BuildContext, low_level: LowLevelPolicy) -> list
     if config.high_level.initial == "iql":
         learner = WarmStart(sac, config.high_level.hidden, horizon, config.flow)
     else:
-        learner = CalQL(sac, horizon, context.dataset.longest_episode(), config.flow)
+        learner = CalQL(sac, horizon, longest_episode(context.dataset.ends), config.flow)
     labels = ("labels",)
     drops = () if _online_reads_labels(config) else labels
     return [offline_phase(context, AGENT, learner, config.flow.updates, reads=labels, drops=drops)]

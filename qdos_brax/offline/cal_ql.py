@@ -21,7 +21,7 @@ from qdos_brax.data.segments import macro_return
 from qdos_brax.data.transitions import Transition, macro_transitions
 from qdos_brax.high_level.sac import SAC, SACHyper, SACState
 from qdos_brax.nn.networks import tanh_gaussian_sample
-from qdos_brax.nn.optim import Params, adam_step, polyak
+from qdos_brax.nn.optim import Params
 
 
 class CalQLHyper(struct.PyTreeNode):
@@ -145,9 +145,7 @@ class CalQL:
             return error + hyper.weight * gap.sum(), (error, gap.mean())
 
         grads, (error, gap) = jax.grad(loss, has_aux=True)(state.critic)
-        critic, opt_state = adam_step(state.critic, state.critic_opt_state, grads, hyper.sac.learning_rate)
-        targets = polyak(state.target_critic, critic, hyper.sac.target_rate)
-        state = state.replace(critic=critic, critic_opt_state=opt_state, target_critic=targets)
+        state = self._sac.move_critic(state, grads, hyper.sac)
         state, info = self._sac.update_actor(state, batch, actor_key, hyper.sac)
         info |= {"critic_loss": error / self._sac.ensemble, "conservative_gap": gap, "q": jnp.mean(target)}
         return state, info

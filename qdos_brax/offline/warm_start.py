@@ -21,7 +21,7 @@ from qdos_brax.data.device import DeviceData
 from qdos_brax.data.transitions import Transition, macro_transitions
 from qdos_brax.high_level.sac import SAC, SACHyper, SACState
 from qdos_brax.nn.networks import MLP, tanh_gaussian_log_prob
-from qdos_brax.nn.optim import ADAM, Params, adam_step, polyak
+from qdos_brax.nn.optim import ADAM, Params, adam_step
 from qdos_brax.offline.iql_policy import regression_weight
 from qdos_brax.skills.values import expectile_loss
 
@@ -94,19 +94,13 @@ class WarmStart:
 
         target = self.target(value, batch, hyper.sac.discount)
         critic_loss, grads = jax.value_and_grad(self._sac.critic_loss)(sac.critic, batch, target)
-        critic, critic_opt_state = adam_step(sac.critic, sac.critic_opt_state, grads, rate)
+        sac = self._sac.move_critic(sac, grads, hyper.sac)
 
         weight = regression_weight(q - self.value(value, batch.observation), hyper.inverse_temperature)
         actor_loss, grads = jax.value_and_grad(self.actor_loss)(sac.actor, batch, weight)
         actor, actor_opt_state = adam_step(sac.actor, sac.actor_opt_state, grads, rate)
 
-        sac = sac.replace(
-            actor=actor,
-            critic=critic,
-            target_critic=polyak(sac.target_critic, critic, hyper.sac.target_rate),
-            actor_opt_state=actor_opt_state,
-            critic_opt_state=critic_opt_state,
-        )
+        sac = sac.replace(actor=actor, actor_opt_state=actor_opt_state)
         info = {"value_loss": value_loss, "critic_loss": critic_loss / self._sac.ensemble, "q": jnp.mean(target)}
         info |= {"actor_loss": actor_loss, "policy_weight": jnp.mean(weight)}
         return WarmStartState(sac, value, value_opt_state), info
