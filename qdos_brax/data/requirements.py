@@ -83,10 +83,8 @@ def _states(data: Rows | Dataset, env: Task, config: Config) -> list[str]:
     missing = _missing_states(data, env)
     if not missing:
         return []
-    return [
-        f"no {missing}, the simulator states from which {config.method} rolls out its skills: use "
-        "--set skills.mi_rollout=logged"
-    ]
+    use = "--alpha 0" if skills.mi_encoder == "outcome" else "--set skills.mi_rollout=logged"
+    return [f"no {missing}, the simulator states from which {config.method} rolls out its skills: use {use}"]
 
 
 def _things(data: Rows | Dataset, env: Task, config: Config) -> list[str]:

@@ -54,8 +54,10 @@ def read(path: Path) -> Bundle:
     """Return the bundle in a file, which may come from a stranger.
 
     Raises:
-        UserError: it is no such file, damaged, or of a newer format.
+        UserError: it is a folder or no such file, damaged, or of a newer format.
     """
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: `python -m qdos_brax export {path} --out FILE` makes the file of a run")
     try:
         with safe_open(path, framework="numpy") as file:
             header = dict(file.metadata() or {})

@@ -88,6 +88,8 @@ def test_rollouts_need_the_whole_state() -> None:
         data = replace(lacking("nothing"), **dict.fromkeys(missing))
         (line,) = unmet(data, PointEnv(), config_of("qdos"))
         assert line.startswith(says) and "skills.mi_rollout=logged" in line
+        outcome = {"skills.mi_encoder": "outcome"}  # what logged states cannot tell
+        assert unmet(data, PointEnv(), config_of("qdos", **outcome))[0].endswith("use --alpha 0")
         assert unmet(data, PointEnv(), config_of("qdos", **{"skills.mi_rollout": "logged"})) == []
         assert unmet(data, PointEnv(), config_of("supe")) == []
         assert unmet(data, PointEnv(), config_of("qdos", **{"skills.alpha": 0.0})) == []  # nothing is rolled out

@@ -139,6 +139,18 @@ def test_foreign_and_newer_files_are_refused(exported: Path, capsys: pytest.Capt
         assert len(lines) == 1 and message in lines[0], lines
 
 
+def test_a_run_folder_in_place_of_its_file_names_the_command(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    skills = ["train", "--env", "antmaze-medium", "--preset", "smoke", "--skills", str(finished)]
+    assert main([*skills, "--out", str(tmp_path / "run")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert (
+        line
+        == f"error: {finished} is a folder: `python -m qdos_brax export {finished} --out FILE` makes the file of a run"
+    )
+
+
 def test_a_card_without_bottom_is_refused(exported: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its checksum is right, and no JSON reader follows it."""
     arrays, card = {"x": np.zeros(1, np.float32)}, "[" * 200_000
