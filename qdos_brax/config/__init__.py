@@ -2,9 +2,9 @@
 
 Layers, each laid over the one before: the defaults of the fields (the paper's values), ``configs/<family>.yaml``, the
 method's published values (``config/methods.py``), ``configs/presets/<preset>.yaml`` with its own sections
-(``low_level:``, by the method's low-level policy, and over it ``families:``, which may hold ``low_level:`` again and,
-over that, ``variants:``, such as one maze), the flags of the command line, ``--set key=value``. ``python -m qdos_brax
-config KEY`` shows which layer set a value.
+(``low_level:``, by the method's low-level policy, over it ``methods:``, and over both ``families:``, which may hold
+``variants:``, such as one maze, and over them ``low_level:`` and ``methods:`` again), the flags of the command line,
+``--set key=value``. ``python -m qdos_brax config KEY`` shows which layer set a value.
 
 The mark ``metadata["scan"]`` of a field separates two kinds. A scannable field is a number that a learner takes as an
 argument of its jitted program: it may hold a list, and every member of the scan gets its own value without a new

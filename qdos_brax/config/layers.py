@@ -154,9 +154,11 @@ def _spec(env: str) -> envs.TaskSpec:
 
 
 def _preset_layers(name: str, family: str, variant: str | None, method: str) -> list[Layer]:
-    """Return a preset's values, those of its sections over them; a family's section may have ``variants``, and over
-    them ``low_level`` again, since how often a method decides weighs more than which of the family's tasks it plays,
-    and over all of them ``methods``, for what one method alone can do.
+    """Return a preset's values, over them those of its sections ``low_level`` and ``methods`` and of the family.
+
+    A family's section may have ``variants``, and over them ``low_level`` again, since how often a method decides
+    weighs more than which of the family's tasks it plays, and over all of them ``methods``, for what one method alone
+    can do.
     """
     low_level = METHODS[method].low_level
     if name not in presets():
@@ -166,7 +168,12 @@ def _preset_layers(name: str, family: str, variant: str | None, method: str) -> 
     kinds = sorted({method.low_level for method in METHODS.values()})
     sections = _take_section(content, "families", sorted({*families(), *envs.FAMILIES}), path)
     of_low_level = _take_section(content, "low_level", kinds, path)
-    layers = [(title, content), (f"{title}, section low_level.{low_level}", of_low_level.get(low_level))]
+    of_method = _take_section(content, "methods", list(METHODS), path)
+    layers = [
+        (title, content),
+        (f"{title}, section low_level.{low_level}", of_low_level.get(low_level)),
+        (f"{title}, section methods.{method}", of_method.get(method)),
+    ]
     if of_family := sections.get(family):
         known = sorted(envs.FAMILIES[family].variants) if family in envs.FAMILIES else []
         of_variant = _take_section(of_family, "variants", known, path)

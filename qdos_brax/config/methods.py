@@ -75,21 +75,25 @@ _OFFLINE_WIDTHS = {
 }
 
 # Li, Zhou, Levine 2025, "Reinforcement learning with action chunking" (arXiv 2507.07969, table of hyperparameters and
-# code ColinQiyangLi/qc): chunks of 5 actions, 4 layers of 512, 2 critics, a step of everything per environment step
-# (5 per chunk), none in the first 5,000, in which the offline policy acts.
+# code ColinQiyangLi/qc): chunks of 5 actions, 4 layers of 512, 2 critics, discount 0.99, data and experience in one
+# buffer, a step of everything per environment step (5 per chunk), none in the first 5,000, in which the offline policy
+# acts.
 _CONTINUED = {
     "high_level.hidden": [512, 512, 512, 512],
     "high_level.ensemble": 2,
+    "high_level.discount": 0.99,
+    "high_level.offline_fraction": "auto",
     "labels.rnd_coefficient": 0.0,
 }
 _CHUNKS = _CONTINUED | {"skills.horizon": 5, "high_level.utd": 5, "high_level.actor_updates": 5}
 
 # Park, Li, Levine 2025, "Flow Q-learning" (arXiv 2502.02538, table and the commands of seohongpark/fql): alpha by task,
-# the minimum of the critics on ant mazes, discount 0.995 where it is said.
+# that of going on online where it is another (ball 30 for 10, humanoid 100 for 30), the minimum of the critics on ant
+# mazes, discount 0.995 where it is said.
 _FQL: dict[str, dict[str, Any]] = {
     "antmaze": {"flow.distillation": 10.0, "flow.target": "min"},
-    "antsoccer": {"flow.distillation": 10.0, "high_level.discount": 0.995},
-    "humanoidmaze": {"flow.distillation": 30.0, "high_level.discount": 0.995},
+    "antsoccer": {"flow.distillation": 30.0, "high_level.discount": 0.995},
+    "humanoidmaze": {"flow.distillation": 100.0, "high_level.discount": 0.995},
     "cube": {"flow.distillation": 300.0},
     "scene": {"flow.distillation": 300.0},
 }

@@ -60,7 +60,14 @@ class HighLevelConfig:
     ensemble: int = count(10, "number of critics")
     target_subset: int = count(1, "critics drawn for the minimum in the target")
     batch_size: int = count(256, "macro transitions per gradient step", low=2)
-    offline_fraction: float = number(0.5, "share of a batch taken from the labelled data", high=1.0, scan=False)
+    offline_fraction: float | str = number(
+        0.5,
+        "share of a batch taken from the labelled data; auto draws uniformly from the steps of data and experience, as "
+        "of one buffer",
+        high=1.0,
+        scan=False,
+        auto=True,
+    )
     utd: int = count(20, "critic steps per macro step of experience")
     actor_updates: int = count(
         1, "steps of actor and temperature per macro step, evenly among the critics' (SUPE: 4 among 80)"

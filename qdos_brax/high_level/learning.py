@@ -14,6 +14,7 @@ from qdos_brax.data.device import DeviceData
 from qdos_brax.data.transitions import Transition, macro_transitions
 from qdos_brax.high_level import replay as replay_buffer
 from qdos_brax.high_level.actor_critic import ActorCritic, Reference
+from qdos_brax.high_level.batches import make_batches
 from qdos_brax.high_level.skill_learning import Lesson, SkillLearning
 from qdos_brax.labels.bonus import Bonus
 from qdos_brax.labels.offline_reward import OfflineReward
@@ -77,7 +78,7 @@ class Learning:
         self._skill_learning = skill_learning
         self._config, self._labels, self._horizon = config.high_level, config.labels, config.skills.horizon
         self._high_level, self._low_level, self._labeller, self._bonus = high_level, low_level, labeller, bonus
-        self._offline = round(self._config.batch_size * self._config.offline_fraction)
+        self._batches = make_batches(config)
         self._rate = rate_schedule(self._config.schedule, self._config.env_steps)
 
     def init(self, keys: Learners, hyper: dict[str, jax.Array]) -> Learners:
@@ -119,21 +120,18 @@ class Learning:
         return learners, info | {"bonus": jnp.mean(earned)} | skill_info
 
     def sample(self, learners: Learners, key: jax.Array, sources: Sources) -> Transition:
-        """Return a batch, offline rows first, with the bonus for novelty added to rewards."""
-        online_key, offline_key = jax.random.split(key)
-        rows = replay_buffer.sample(sources.replay, online_key, self._config.batch_size - self._offline)
-        if self._offline:
-            offline = self._sample_offline(learners, offline_key, sources)
-            rows = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), offline, rows)
+        """Return a batch, with the bonus for novelty added to rewards."""
+        offline = partial(self._sample_offline, learners, sources)
+        rows, logged = self._batches.draw(key, sources.replay, sources.data.starts.shape[0], offline)
         bonus = self._bonus.of(learners.bonus, rows.observation, rows.action, sources.hyper)
         if self._labels.bonus_rows == "online":
-            bonus = jnp.where(jnp.arange(len(rows.reward)) < self._offline, 0.0, bonus)
+            bonus = jnp.where(logged, 0.0, bonus)
         return rows._replace(reward=rows.reward + bonus)
 
-    def _sample_offline(self, learners: Learners, key: jax.Array, sources: Sources) -> Transition:
+    def _sample_offline(self, learners: Learners, sources: Sources, key: jax.Array, rows_wanted: int) -> Transition:
         """Return labelled segments, with the reward and mask that the labeller gives them."""
         data, discount = sources.data, sources.hyper["high_level.discount"]
-        index = jax.random.randint(key, (self._offline,), 0, data.starts.shape[0])
+        index = jax.random.randint(key, (rows_wanted,), 0, data.starts.shape[0])
         rows = macro_transitions(data, data.starts[index], self._horizon, discount, sources.labels[index])
         reward, mask = self._labeller.label(learners.labeller, rows, discount)
         return rows._replace(reward=reward, mask=mask)
@@ -143,7 +141,7 @@ class Learning:
 
         ExPLORe's code gives its reward model as many rows as the critics have in all, of which half are online.
         """
-        rate, online = sources.hyper["labels.reward_learning_rate"], self._config.batch_size - self._offline
+        rate, online = sources.hyper["labels.reward_learning_rate"], self._batches.online
 
         def step(labeller: Any, key: jax.Array) -> tuple[Any, None]:
             rows = replay_buffer.sample(sources.replay, key, online)

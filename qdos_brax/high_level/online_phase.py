@@ -60,7 +60,7 @@ class OnlinePhase(MemberPhase):
 
     Each iteration plays one macro step in every environment, stores them, and makes ``utd`` critic steps and
     ``actor_updates`` of the actor per macro step played. Of a batch, ``offline_fraction`` is labelled data, the rest
-    online experience.
+    online experience (``qdos_brax.high_level.batches``).
 
     Args:
         config: the run's configuration.

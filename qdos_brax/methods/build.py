@@ -18,6 +18,7 @@ from qdos_brax.data.dataset import Dataset, longest_episode
 from qdos_brax.data.device import DeviceData, to_device
 from qdos_brax.data.requirements import refuse, unmet
 from qdos_brax.high_level.actor_critic import AGENT, ActorCritic
+from qdos_brax.high_level.batches import make_batches
 from qdos_brax.high_level.jump_start import JumpStart
 from qdos_brax.high_level.online_phase import OnlinePhase
 from qdos_brax.high_level.sac import SAC
@@ -84,7 +85,7 @@ def build_phases(context: BuildContext) -> list[MemberPhase]:
     low_level, high_level = make_low_level(config, env), make_actor_critic(config, env)
     if method.policy is not None:
         return [_policy_phase(context, method.policy)]
-    labelled = _online_reads_labels(config) or config.high_level.initial != "random"
+    labelled = make_batches(config).offline > 0 or config.high_level.initial != "random"
     guide = None if method.guide is None else _GUIDES[method.guide](config, env)
     return [
         *skill_phases(context),
@@ -164,13 +165,8 @@ def _warm_start_phases(context: BuildContext, low_level: LowLevelPolicy) -> list
     else:
         learner = CalQL(sac, horizon, longest_episode(context.dataset.ends), config.flow)
     labels = ("labels",)
-    drops = () if _online_reads_labels(config) else labels
+    drops = () if make_batches(config).offline else labels
     return [offline_phase(context, AGENT, learner, config.flow.updates, reads=labels, drops=drops)]
-
-
-def _online_reads_labels(config: Config) -> bool:
-    """Return whether some of an online batch is labelled data."""
-    return round(config.high_level.batch_size * config.high_level.offline_fraction) > 0
 
 
 def _warm_up(config: Config, method: Method) -> WarmUp:

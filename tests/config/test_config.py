@@ -70,6 +70,7 @@ def test_layers_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     preset = """
 skills: {alpha: 0.4, kl_weight: 0.5, horizon: 8}
 low_level: {action: {high_level: {utd: 3, discount: 0.9}}}
+methods: {rlpd: {high_level: {utd: 7, discount: 0.95}}}
 families:
   antmaze:
     skills: {kl_weight: 0.6}
@@ -100,7 +101,14 @@ families:
     assert load_config("antmaze-large", "tiny").high_level.discount == 0.8
     # Over everything else of the preset, what is for one method.
     assert load_config("antmaze-medium", "tiny", {"method": "rlpd"}).high_level.discount == 0.5
-    assert load_config("antsoccer", "tiny", {"method": "rlpd"}).high_level.discount == 0.9
+    alone = load_config("antsoccer", "tiny", {"method": "rlpd"}).high_level
+    assert (alone.utd, alone.discount) == (7, 0.95)  # of one method, over its low-level policy's
+    assert load_config("antmaze", "tiny", {"method": "rlpd"}).high_level.utd == 7  # under the family's, which is silent
+    with pytest.raises(UserError, match="unknown entry 'rldp' in methods, did you mean 'rlpd'"):
+        (tmp_path / "presets" / "tiny.yaml").write_text(
+            preset.replace("methods: {rlpd: {high_level: {utd", "methods: {rldp: {high_level: {utd")
+        )
+        load_config("antsoccer", "tiny")
     (tmp_path / "presets" / "tiny.yaml").write_text(preset.replace("medium", "medum"))
     with pytest.raises(UserError, match="unknown entry 'medum' in variants, did you mean 'medium'"):
         load_config("antmaze-large", "tiny")

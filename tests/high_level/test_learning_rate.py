@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any, cast
 
 import jax
@@ -43,7 +44,8 @@ def test_a_step_is_as_long_as_the_schedule_says(schedule: str, env_steps: int, f
     row = Transition(jnp.ones(2), jnp.ones(2) / 2, jnp.ones(()), jnp.ones(()), -jnp.ones(2))
     rows = replay.insert(replay.create(row, 4), jax.tree.map(lambda x: x[None], row))
     before = learning.init(Learners(*jax.random.split(jax.random.key(0), 4)), hyper)
-    sources = Sources(rows, cast(Any, None), {}, {}, hyper)
+    no_data = cast(Any, SimpleNamespace(starts=jnp.zeros(0, jnp.int32)))
+    sources = Sources(rows, no_data, {}, {}, hyper)
     after, _ = learning.step(before, (jax.random.key(1), row), jnp.asarray(env_steps), sources)
     for part in ("actor", "critic"):
         old, new = (jax.tree.leaves(getattr(learners.high_level, part)) for learners in (before, after))

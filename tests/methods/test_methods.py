@@ -116,6 +116,18 @@ def test_published_values() -> None:
     assert (kitchen["wsrl"].values.expectile, kitchen["wsrl"].flow.updates) == (0.7, 250_000)
 
 
+@pytest.mark.parametrize("preset", ["cpu", "paper"])
+@pytest.mark.parametrize(
+    ("task", "discount"),
+    [("antmaze-medium", 0.99), ("antsoccer", 0.995), ("cube-single", 0.99), ("scene", 0.99), ("kitchen-mixed", 0.99)],
+)
+def test_flows_learn_as_published_whatever_the_preset(preset: str, task: str, discount: float) -> None:
+    """Two critics, the discount of a control step, data and experience in one buffer (Q-chunking, FQL)."""
+    for method in ("qc", "qc-fql", "fql"):
+        high = configs.from_layers(configs.run_layers(task, preset, {"method": method})).high_level
+        assert (high.ensemble, high.discount, high.offline_fraction) == (2, discount, "auto"), method
+
+
 @pytest.mark.parametrize("preset", ["cpu", "paper", "smoke"])
 def test_rivals_with_a_bonus_have_the_labels_of_supes_code_in_every_preset(preset: str) -> None:
     """Of normalised observations the bonus is small, and supe found no goal of antmaze-large (results.md)."""
