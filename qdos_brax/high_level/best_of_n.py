@@ -1,8 +1,8 @@
 """Best of N: a flow policy clones the data and experience, and the critic chooses among N of its proposals.
 
 Q-chunking (Li, Zhou, Levine 2025, arXiv 2507.07969, Algorithm 1 and 2; code ColinQiyangLi/qc, actor_type best-of-n):
-decisions are chunks of 5 actions, N = 32, and the same choice, by the mean of the online critics, acts, is evaluated,
-and gives the target's next chunk, whose value is that of the target critics.
+decisions are chunks of 5 actions, N = 32, and the same choice, by the online critics (their mean, or what
+``flow.target`` says), acts, is evaluated, and gives the target's next chunk, whose value is that of the target critics.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class RandomWarmUp:
 
 
 class OfflineWarmUp:
-    """Play what was learned offline, and learn only once it has been seen online (WSRL, Zhou et al. 2025; QC, FQL).
+    """Play what was learned offline, and learn only once it has been seen online (WSRL, Zhou et al. 2025; Q-chunking).
 
     Args:
         env_steps: length of the warm-up.
